@@ -205,16 +205,16 @@ def follows_links(overrides: Sequence[str]) -> bool:
     return any(leaf.keys == ("data", "follow_links") and leaf.value == "true" for leaf in leaves)
 
 
-def data_section(overrides: list[str], capture_format: str = "auto") -> DataConfig:
+def data_section(overrides: list[str]) -> DataConfig:
     """Build the data section from ``data.key=value`` overrides; its root is a placeholder."""
     from dyngs.config.io import load_config
 
     for word in overrides:
-        if not word.startswith("data.") or word.startswith(("data.root=", "data.format=")):
+        if not word.startswith("data.") or word.startswith("data.root="):
             raise DyngsError(
                 f"{word!r}: only keys of data are accepted, such as data.follow_links=true"
             )
-    return load_config(None, ["data.root=.", f"data.format={capture_format}", *overrides]).data
+    return load_config(None, ["data.root=.", *overrides]).data
 
 
 # ---------------------------------------------------------------------------------- inputs, outputs

@@ -66,12 +66,7 @@ def _add_inspect(verbs: args.Commands) -> None:
     )
     path = "capture (folder or .zip), video, or folder of photos or videos"
     parser.add_argument("path", type=args.input_path, metavar="PATH", help=path)
-    args.add_overrides(parser, "data.key=value", "keys of data, such as data.follow_links=true")
-    parser.add_argument(
-        "--format",
-        default="auto",
-        help="format of the capture (default: detected)",
-    )
+    args.add_overrides(parser, "data.key=value", "keys of data, such as data.format=colmap")
     parser.add_argument(
         "--image",
         type=args.output_path,
@@ -217,9 +212,9 @@ def run_inspect(arguments: argparse.Namespace) -> int:
     if is_videos(arguments.path):
         return _inspect_videos(arguments)
     # The full size is reported, instead of that in training.
-    options = args.data_section(
-        ["data.longest_side=0", *arguments.overrides], arguments.format
-    ).model_copy(update={"root": arguments.path})
+    options = args.data_section(["data.longest_side=0", *arguments.overrides]).model_copy(
+        update={"root": arguments.path}
+    )
     is_photos = is_unposed(options)
     report = inspect_photos(options) if is_photos else inspect_capture(options, arguments.deep)
     if report.capture is None and not is_photos:

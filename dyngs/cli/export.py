@@ -43,7 +43,7 @@ _TAKES = dict.fromkeys(SPLAT_FORMATS, f"{_SPLATS} sh_degree classic") | {
     "cameras": "",
     "html": "time motion from_up folder max_gaussians_drawn title view",
     "mesh of a person": "motion",
-    "mesh": "time times up from_up level segments cells",
+    "mesh": "time times up from_up level cells",
     "bodies": "time up from_up classic",
 }
 """Options that each format accepts."""
@@ -120,9 +120,6 @@ def add_parser(commands: args.Commands) -> None:
     about = "--format mesh: grid cells along the longest side of the scene (default 192)"
     kind = args.integer_type("a number of cells", 8, 1024)
     parser.add_argument("--cells", type=kind, metavar="N", help=about)
-    about = "--format mesh of curved triangles: segments per edge (default 6)"
-    kind = args.integer_type("a number of segments", 1, 64)
-    parser.add_argument("--segments", type=kind, metavar="N", help=about)
     about = "--format html, sog: write a folder for a web server, streamed on demand"
     parser.add_argument("--folder", action="store_true", help=about)
     args.add_max_gaussians_drawn(
@@ -580,7 +577,7 @@ def _export_surface(arguments: argparse.Namespace) -> list[Path]:
             "file"
         )
     opened = _open(arguments)
-    options = SurfaceOptions(arguments.level, arguments.cells, arguments.segments)
+    options = SurfaceOptions(arguments.level, arguments.cells)
     how, line = surface_write_options(
         opened, ".ply" if arguments.times else out.suffix, arguments.up, arguments.from_up
     )

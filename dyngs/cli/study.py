@@ -65,9 +65,6 @@ def add_parser(commands: args.Commands) -> None:
     limit.add_argument("--steps", type=kind, metavar="N", help="train each model for N steps")
     about = "limit the file size of each model, 1e6 bytes"
     limit.add_argument("--max-mb", type=amount, metavar="MB", help=about)
-    kind = args.integer_type("a number of views", 1, 20)
-    about = "number of views on the page (default 4)"
-    parser.add_argument("--views", type=kind, default=4, metavar="N", help=about)
     _add_common(parser, "compare/CAPTURE")
 
 
@@ -132,7 +129,6 @@ def run_compare(arguments: argparse.Namespace) -> int:
                 max_mb=arguments.max_mb,
                 out=arguments.out,
                 split=arguments.split,
-                views=arguments.views,
                 threads=arguments.threads,
                 device=arguments.device,
                 ray_cores=arguments.ray,
@@ -152,7 +148,8 @@ def _print_report(report: Report, *, is_json: bool) -> None:
     if is_json:
         print(paths[1].read_text(encoding="utf-8"), end="")
         return
-    print_tables(*(numbers_table(table.title, table.head, table.cells) for table in report.tables))
+    table = report.table
+    print_tables(numbers_table(table.title, table.head, table.cells))
     for name, problem in report.left_out.items():
         print_lines(f"skipped: {name}: {problem}")
     print(f"written: {paths[0]} and {', '.join(path.suffix for path in paths[1:])}")
@@ -202,7 +199,7 @@ def _tradeoff(arguments: argparse.Namespace, out: Path) -> int:
         "Quality, speed and size",
         about,
         rows,
-        [build_table(about, rows)],
+        build_table(about, rows),
         {"changes": [variant.changes for variant in variants]},
         figure=plot_variants(rows, settings) if can_plot() else None,
     )

@@ -55,8 +55,7 @@ def write_surface(
     scene = opened.renderable
     for name, value in vars(options).items():
         if value is not None and name not in scene.surface_options:
-            known = ", ".join(f"--{one}" for one in sorted(scene.surface_options))
-            raise DyngsError(f"--{name}: not supported for the mesh of this scene; use {known}")
+            raise DyngsError(f"--{name}: not supported for the mesh of this scene; remove it")
     if suffix not in SUFFIXES:
         raise DyngsError(f"{out}: a mesh file must end in {', '.join(SUFFIXES)}")
     collect_inputs(opened).require_output(out)

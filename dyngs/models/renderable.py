@@ -42,12 +42,10 @@ class SurfaceOptions:
         level: density at the surface of a field, per unit of a world whose innermost cube has half
             side 1.5.
         cells: along the longest side of the space that a field or Gaussians are looked at in.
-        segments: of an edge of a curved triangle.
     """
 
     level: float | None = None
     cells: int | None = None
-    segments: int | None = None
 
 
 R = TypeVar("R", bound="Renderable")

@@ -53,6 +53,7 @@ from dyngs.training.trainer import Trainer
 MOST_STEPS = 1_000_000
 TIMED_VIEWS = 4  # Views used for timing
 ROUNDS = 3  # Renders of each timed view
+SHOWN_VIEWS = 4  # Held-out views on the page
 CURVE_VIEWS = 6  # Held-out views scored during training
 # Fractions of a run after which these are scored; denser at the start, where PSNR rises fast
 MARKS = tuple((i / 12) ** 2 for i in range(1, 12))
@@ -70,7 +71,6 @@ def compare(
     max_mb: float | None = None,
     out: Path | str | None = None,
     split: str = "test",
-    views: int = 4,
     threads: int = 0,
     device: str = "auto",
     ray_cores: int | None = None,
@@ -95,7 +95,6 @@ def compare(
         minutes, steps, max_mb: the budget, exactly one of them.
         out: output folder; None: compare/CAPTURE.
         split: held-out views to compare on.
-        views: number of views on the page.
         threads, device: of each training.
         ray_cores: cores per model with Ray; None trains one model after the other.
         overrides: ``section.key=value`` for all models.
@@ -113,7 +112,7 @@ def compare(
         raise DyngsError("give one common limit: minutes, steps or max_mb")
     words = tuple(overrides)
     comparison = ModelComparison(
-        capture, out, minutes, steps, max_mb, split, words, threads, device, views
+        capture, out, minutes, steps, max_mb, split, words, threads, device
     )
     configs, unfit = comparison.configs([str(model) for model in models])
     for config in configs.values():
@@ -131,7 +130,7 @@ def compare(
         "Comparison",
         about,
         rows,
-        [build_table(about, rows)],
+        build_table(about, rows),
         left_out=unfit | left_out,
         views=page_views(out, results),
         figure=plot_curves(curves) if can_plot() and any(curves.values()) else None,
@@ -153,7 +152,6 @@ class ModelComparison:
     overrides: tuple[str, ...] = ()
     threads: int = 0
     device: str = "auto"
-    num_shown: int = 4  # held-out views on the page
 
     @property
     def limit(self) -> str:
@@ -264,7 +262,7 @@ class ModelComparison:
             self.device,
             TIMED_VIEWS,
             ROUNDS,
-            self.num_shown,
+            SHOWN_VIEWS,
         )
         study_scenes = {
             name: StudyScene(name, name, self.run_dir(name), partial(self._train, config))

@@ -69,7 +69,7 @@ class Report:
     title: str
     about: str
     rows: Sequence[Row]
-    tables: Sequence[Table]
+    table: Table
     values: Mapping[str, Any] = field(default_factory=dict)
     left_out: Mapping[str, str] = field(default_factory=dict)
     views: Sequence[Mapping[str, Any]] = ()
@@ -115,13 +115,13 @@ def write_report(stem: Path, report: Report) -> list[Path]:
     left_out = "".join(
         f"\nSkipped: {markdown_text(f'{name}: {why}')}\n" for name, why in report.left_out.items()
     )
-    tables = "\n".join(markdown_table(table.head, table.cells) for table in report.tables)
+    table = markdown_table(report.table.head, report.table.cells)
     svg = "" if report.figure is None else figure_to_svg(report.figure)
     values = {"rows": list(report.rows), **report.values, "left_out": dict(report.left_out)}
     texts = {
         "csv": csv_text(report.rows),
         "json": json.dumps(values, indent=2, allow_nan=False) + "\n",
-        "md": f"{markdown_text(report.about)}\n\n{tables}{left_out}",
+        "md": f"{markdown_text(report.about)}\n\n{table}{left_out}",
         "html": page_text(report, svg),
     }
     texts |= {"svg": svg} if svg else {}
@@ -139,15 +139,12 @@ def page_text(report: Report, svg: str) -> str:
         f"<p>Skipped: <b>{escape(name)}</b>: {escape(why)}</p>"
         for name, why in report.left_out.items()
     )
-    tables = "".join(
-        f"<h2>{escape(table.title)}</h2>{html_table(table.head, table.cells)}"
-        for table in report.tables
-    )
+    table = report.table
     pieces = {
         "title": escape(report.title),
         "about": escape(report.about),
         "style": _file("page.css"),
-        "tables": tables,
+        "table": html_table(table.head, table.cells),
         "left_out": left_out,
         "plot": svg,
         "crops": _file("crops.html") if report.views else "",

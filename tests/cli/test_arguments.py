@@ -25,7 +25,7 @@ WORDS = {
     "eval": {"overrides"},
     "data fit": {"overrides"},
     "data people": {"overrides"},
-    "data inspect": {"overrides", "format"},
+    "data inspect": {"overrides"},
     "data motion": {"clip"},
     "data sfm": {"overrides"},
     "train": {"overrides", "host"},

@@ -123,7 +123,7 @@ def test_motion_is_refused_in_one_line(
 
 
 def test_an_unknown_format_is_answered_with_every_format(capsys: PrintedOutput) -> None:
-    line = error_line(capsys, "data", "inspect", ".", "--format", "blendr")
+    line = error_line(capsys, "data", "inspect", ".", "data.format=blendr")
     assert [
         name for name in get_args(DataConfig.model_fields["format"].annotation) if name not in line
     ] == []
@@ -139,7 +139,7 @@ def test_a_person_is_synthesised_and_inspected(tmp_path: Path, capsys: PrintedOu
         (f, c) for f in (0, 1) for c in range(3)
     }
     assert {(view.width, view.height) for view in capture.splits["train"]} == {(12, 12)}
-    assert main(["data", "inspect", str(out), "--format", "body_json"]) == 0
+    assert main(["data", "inspect", str(out), "data.format=body_json"]) == 0
     assert "body_json" in capsys.readouterr().out
 
 

@@ -27,7 +27,7 @@ from dyngs.study import compare
 from dyngs.study.measure import TRUTH
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-OPTIONS = ("--steps", "20", "--threads", "1", "init.num_random=100", "--views", "2")
+OPTIONS = ("--steps", "20", "--threads", "1", "init.num_random=100")
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +79,7 @@ def test_the_page_has_everything_in_it(finished: Path) -> None:
     shown = json.loads(views)
     assert [[model["name"] for model in view["models"]] for view in shown] == [
         ["static", "mip"]
-    ] * 2
+    ] * 3
     png = base64.b64decode(shown[1]["truth"].partition(",")[2])
     assert png == (finished / "images" / TRUTH / "01.png").read_bytes()
     truth, model = (

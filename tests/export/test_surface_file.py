@@ -91,7 +91,6 @@ def test_a_moving_scene_has_a_mesh_for_each_time(
     [
         ("--cells 7", "--cells: '7' is not a number of cells"),
         ("--level 2", "--level: not supported for the mesh"),
-        ("--segments 3", "--segments: not supported for the mesh"),
         (
             "--out x.stl",
             r"x\.stl: a mesh file must end in \.ply, \.glb, \.obj",

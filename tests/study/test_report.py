@@ -95,7 +95,7 @@ def test_names_of_captures_views_and_models_are_shown_and_never_run(tmp_path: Pa
     models = [{"name": NAME, "psnr": 1.0, "image": pixel}]
     views = [{"name": NAME, "truth": pixel, "models": models}]
     table = Table(NAME, ["model"], [[NAME]])
-    report = Report(NAME, NAME, [], [table], left_out={NAME: NAME}, views=views)
+    report = Report(NAME, NAME, [], table, left_out={NAME: NAME}, views=views)
     file = tmp_path / "page.html"
     file.write_text(page_text(report, ""), encoding="utf-8")
     with Browser() as browser:

@@ -170,7 +170,7 @@ class TriangleScene(Renderable):
     unit: float
     options: TriangleOptions = dataclasses.field(default_factory=TriangleOptions)
     background: Tensor | None = None
-    surface_options: ClassVar[frozenset[str]] = frozenset({"segments"})
+    surface_options: ClassVar[frozenset[str]] = frozenset()
 
     def __len__(self) -> int:
         return len(self.patches)
@@ -179,11 +179,10 @@ class TriangleScene(Renderable):
     def own_surface(self, time: float, options: SurfaceOptions) -> Surface:
         """Return each triangle as ``segments``^2 flat faces, with colours without harmonics.
 
-        Triangles do not share vertices. Default ``segments``: as rendered, or as the textures
-        need.
+        Triangles do not share vertices. ``segments``: as rendered, or as the textures need.
         """
         patches = self.patches
-        count = options.segments or max(SEGMENTS, patches.texture)
+        count = max(SEGMENTS, patches.texture)
         places, faces = lattice(count)
         vertices = evaluate_patches(patches.points, places)
         ids = torch.arange(len(patches), dtype=torch.int32, device="cpu").repeat_interleave(

@@ -12,7 +12,7 @@ import trimesh
 from small_triangles import config_of
 
 from dyngs.api.train import train
-from dyngs.baselines.triangles.scene import TriangleScene
+from dyngs.baselines.triangles.scene import SEGMENTS, TriangleScene
 from dyngs.baselines.triangles.training import max_pixels
 from dyngs.cli import main
 from dyngs.config.io import load_resolved
@@ -79,12 +79,12 @@ def test_a_file_that_is_too_small_is_refused(capture: Path, tmp_path: Path) -> N
 @pytest.mark.parametrize("suffix", [".ply", ".glb", ".obj"])
 def test_export_is_a_coloured_mesh(run: Path, tmp_path: Path, suffix: str) -> None:
     out = tmp_path / f"mesh{suffix}"
-    assert main(["export", str(run), "--format", "mesh", "--segments", "2", "--out", str(out)]) == 0
+    assert main(["export", str(run), "--format", "mesh", "--out", str(out)]) == 0
     mesh = trimesh.load(out, force="mesh", process=False)
     assert isinstance(mesh, trimesh.Trimesh)
     scene = open_run(run).renderable
     assert isinstance(scene, TriangleScene)
-    assert len(mesh.faces) == 4 * len(scene.patches)
+    assert len(mesh.faces) == max(SEGMENTS, scene.patches.texture) ** 2 * len(scene.patches)
     visual: Any = mesh.visual
     assert np.ptp(np.asarray(visual.vertex_colors)[:, :3]) > 0
 
@@ -94,12 +94,8 @@ def test_export_is_a_coloured_mesh(run: Path, tmp_path: Path, suffix: str) -> No
     [
         (["export", "RUN", "--out", "OUT/scene.ply"], "Gaussians"),
         (
-            ["export", "RUN", "--format", "mesh", "--segments", "0", "--out", "OUT/mesh.ply"],
-            "1 to 64",
-        ),
-        (
             ["export", "RUN", "--format", "mesh", "--level", "2", "--out", "OUT/mesh.ply"],
-            "--segments",
+            "--level: not supported for the mesh",
         ),
         (["prune", "RUN", "--out", "OUT/pruned"], "Gaussians"),
         (
