@@ -358,6 +358,7 @@ CAPTURES: dict[str, dict[str, Seed]] = {
 }
 """Seeds of each capture format, by its name in ``dyngs.data.read.FORMATS``."""
 _NEEDS = {"people_snapshot": "h5py"}
+# USD is read in a process of its own, too slow for thousands of inputs.
 _PACKED = ("compressed-ply", "spz", "splat", "sog", "glb")
 _RUNS: dict[str, Seed] = {
     kind: partial(files.write_moving_runs, kind) for kind in ("hexplane", "mlp", "control_nodes")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from importlib.util import find_spec
 
 import torch
 from two_balls import cameras_around
@@ -11,6 +12,7 @@ from dyngs.core.camera import Cameras
 from dyngs.core.conventions import num_sh_terms
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import render
+from dyngs.io.formats.formats import FORMATS, Format
 from dyngs.ops.quaternions import rotation_matrices
 
 AROUND = cameras_around(3, 48, 36)
@@ -46,3 +48,9 @@ def cameras_turned(rotation: tuple[float, ...], cameras: Cameras = AROUND) -> Ca
 def psnr(a: torch.Tensor, b: torch.Tensor) -> float:
     """Return the PSNR in dB, at most 100."""
     return float(-10 * torch.log10((a - b).square().mean().clamp_min(1e-10)))
+
+
+def readable() -> list[Format]:
+    """Return the formats whose packages are installed."""
+    needs = {"usd": "pxr", "4dgs": "fourdgs"}
+    return [f for f in FORMATS if f.name not in needs or find_spec(needs[f.name]) is not None]

@@ -18,10 +18,15 @@ from dyngs.core.errors import DyngsError, format_count, log_info
 from dyngs.export.edit.crop import Region, gaussians_in_region
 from dyngs.export.edit.frame import Frame, GeoFrame, gps_frame
 from dyngs.export.edit.merge import merge_scenes
-from dyngs.export.images import compare_file_with_source
+from dyngs.export.images import compare_file_with_run, compare_file_with_source
 from dyngs.export.splat_files import (
+    FOURDGS_SUFFIX,
+    FOURDGS_UP,
+    WriteOptions,
     find_up_direction,
+    read_4dgs_frame,
     splats_at,
+    write_4dgs,
 )
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.formats.formats import (
@@ -152,8 +157,11 @@ def edit_scene(
     The suffix of ``out`` selects the format; without a suffix a run is written. ``reads`` are
     additional input files. Raises DyngsError for impossible edits, before anything is written.
     """
-    if find_format(out) is None and out.suffix:
-        wanted = f"give a name in {all_suffixes()}, or without a suffix for a run"
+    moves = out.name.lower().endswith(FOURDGS_SUFFIX)
+    if find_format(out) is None and not moves and out.suffix:
+        wanted = (
+            f"give a name in {all_suffixes()} or {FOURDGS_SUFFIX}, or without a suffix for a run"
+        )
         raise DyngsError(f"{out}: edits end in a file of Gaussians or a run; {wanted}")
     collect_inputs(source, *edits.merge, *reads).require_output(out)
     found = _opened(source, data_root)
@@ -169,7 +177,7 @@ def edit_scene(
     found = _cropped(found, source, edits, tell)
     if not out.suffix:
         return EditedFile(_written_run(found, source, out, edits, data_root, tell))
-    return _written(found, out, edits, tell)
+    return _written_moving(found, out, edits, tell) if moves else _written(found, out, edits, tell)
 
 
 def write_part(
@@ -221,8 +229,8 @@ def _written(found: EditSource, out: Path, edits: Edits, tell: Tell) -> EditedFi
         raise DyngsError("--merge requires static scenes; make one with `dyngs export --time T`")
     if moving and edits.time is None:
         tell(
-            "time 0 of a moving scene is used; choose with --time T, or write a run with all "
-            f"times: --out {out.stem}"
+            "time 0 of a moving scene is used; choose with --time T, or write all times with "
+            f"--out {out.stem}{FOURDGS_SUFFIX}"
         )
     splat = found.at(edits.time or 0.0)
     if edits.merge:
@@ -240,6 +248,25 @@ def _written(found: EditSource, out: Path, edits: Edits, tell: Tell) -> EditedFi
         edited = transform_file(splat, how, up) if is_new else rotate_file(splat, how.turn, up)
     written = write_splats(out, edited)
     return EditedFile(written.path, compare_file_with_source(splat, written), written.notes)
+
+
+def _written_moving(found: EditSource, out: Path, edits: Edits, tell: Tell) -> EditedFile:
+    """Write all training times of a moving scene."""
+    scene = found.opened.scene
+    if scene.is_static or edits.merge or edits.undo or edits.time is not None:
+        raise DyngsError(
+            f"{out}: {FOURDGS_SUFFIX} holds a scene that moves, at all times, without --merge, --undo and --time; "
+            f"give a name in {all_suffixes()}"
+        )
+    how, up = _frame(found, edits, FOURDGS_UP, tell)
+    writing = (
+        WriteOptions(edit=how, up=up) if edits.has_frame else WriteOptions(turn=how.turn, up=up)
+    )
+    splats, notes = write_4dgs(found.opened, out, scene.times, how=writing)
+    redrawn = compare_file_with_run(
+        found.opened, scene, scene.times[0], splats[0], read_4dgs_frame(out, 0)
+    )
+    return EditedFile(out, redrawn, notes)
 
 
 def _written_run(

@@ -24,6 +24,8 @@ _OPTIONAL = {
     "wandb": "wandb",
     "rerun-sdk": "rerun",
     "zstandard": "zstd",
+    "usd-core": "usd",
+    "fourdgs": "4dgs",
     "h5py": "people",
     "pillow-heif": "heic",
     "ray": "ray",

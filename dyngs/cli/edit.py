@@ -48,7 +48,7 @@ def add_parser(commands: args.Commands) -> None:
     parser.add_argument(
         "source", type=args.input_path, metavar="RUN|FILE", help="run folder, or file of Gaussians"
     )
-    about = "file to write (.ply, .spz, .glb ...); without a suffix: new run folder"
+    about = "file to write (.ply, .spz, .glb, .4dgs for moving scenes ...); without a suffix: new run folder"
     parser.add_argument(
         "--out", type=args.output_path, required=True, metavar="FILE|RUN2", help=about
     )

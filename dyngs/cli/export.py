@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from dyngs.cli import arguments as args
 from dyngs.cli.imports import heavy_imports
 from dyngs.cli.output import ProgressBar, print_notes, print_written
-from dyngs.cli.splats import SPLAT_FORMATS, add_axes, print_image_difference
+from dyngs.cli.splats import MOVING, SPLAT_FORMATS, add_axes, print_image_difference
 from dyngs.core.errors import DyngsError, format_count, quote_path
 from dyngs.core.plugins import EXPORTERS, load_plugin, plugin_entries
 
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from dyngs.runs.opened import OpenedScene
 
 _OTHER_SUFFIXES = {
+    f".{MOVING}": MOVING,
     ".npz": "tracks",
     ".safetensors": "avatar",
     ".dyngs": "dyngs",
@@ -34,6 +35,7 @@ _OTHER_SUFFIXES = {
 _SPLATS = "time times motion static dynamic up from_up"
 _TAKES = dict.fromkeys(SPLAT_FORMATS, f"{_SPLATS} sh_degree classic") | {
     "sog": f"{_SPLATS} sh_degree classic folder",
+    MOVING: _SPLATS,
     "tracks": "time times motion dynamic",
     "dyngs": "max_change",
     "avatar": "",
@@ -52,6 +54,7 @@ examples:
   dyngs export runs/dance --time 0.5 --out middle.ply             the scene at one time
   dyngs export runs/bench --out bench.spz                         the suffix selects the format: .glb, .sog ...
   dyngs export runs/dance --times 0:1:30 --out frames             a sequence frame_0000.ply ...
+  dyngs export runs/dance --out dance.4dgs                        all training times in one file
   dyngs export runs/balls --bodies --out balls.glb                rolling balls as animated nodes
   dyngs export runs/ann --motion walk.npz --out walk              a person (model.kind=human), one file per frame
   dyngs export runs/ann --format avatar --out ann.safetensors     an avatar file, for `render` and `export`
@@ -86,6 +89,7 @@ def add_parser(commands: args.Commands) -> None:
     )
     formats = (
         *SPLAT_FORMATS,
+        MOVING,
         "tracks",
         "dyngs",
         "avatar",
@@ -132,7 +136,7 @@ def add_parser(commands: args.Commands) -> None:
     add_axes(parser)
     about = (
         "fit opacities, scales and (without SH) colours to viewers without antialiasing (default: "
-        "only for .splat and .glb, which cannot store that a scene is antialiased)"
+        "only for .splat, .glb and USD, which cannot store that a scene is antialiased)"
     )
     parser.add_argument("--classic", action=argparse.BooleanOptionalAction, help=about)
     part = parser.add_mutually_exclusive_group()
@@ -228,6 +232,8 @@ def _write(arguments: argparse.Namespace) -> list[Path]:
         print_notes(("the scene is static: all times are the same",))
     if kind == "tracks":
         return _export_tracks(arguments, opened, times)
+    if kind == MOVING:
+        return _export_moving(arguments, opened, times or opened.scene.times or (0.0,))
     return _export_splats(arguments, opened, times, kind)
 
 
@@ -408,6 +414,34 @@ def _export_splats(
 def _shown(count: int) -> list[int]:
     """Return the indices of the files or times that are rendered for comparison."""
     return sorted({0, count // 2, count - 1})
+
+
+def _export_moving(
+    arguments: argparse.Namespace, opened: OpenedScene, times: tuple[float, ...]
+) -> list[Path]:
+    """Write all times as one .4dgs file."""
+    from dyngs.export.images import compare_file_with_run
+    from dyngs.export.splat_files import (
+        FOURDGS_SUFFIX,
+        FOURDGS_UP,
+        choose_write_options,
+        read_4dgs_frame,
+        scene_part,
+        write_4dgs,
+    )
+
+    how, line = choose_write_options(opened, FOURDGS_UP, arguments.up, arguments.from_up)
+    print_notes((line,))
+    part = _part(arguments)
+    scene = scene_part(opened.scene, part)
+    path = _target(arguments, f"splats{FOURDGS_SUFFIX}")
+    splats, notes = write_4dgs(opened, path, times, part, how)
+    found = [
+        compare_file_with_run(opened, scene, times[i], splats[i], read_4dgs_frame(path, i))
+        for i in _shown(len(times))
+    ]
+    print_image_difference(notes, found)
+    return [path]
 
 
 def _export_tracks(

@@ -8,14 +8,16 @@ from collections.abc import Sequence
 from dyngs.cli.arguments import AXES
 from dyngs.cli.output import print_notes
 
-SPLAT_FORMATS = ("ply", "compressed-ply", "spz", "splat", "sog", "glb")
+SPLAT_FORMATS = ("ply", "compressed-ply", "spz", "splat", "sog", "glb", "usd")
 """Names of ``dyngs.io.formats.formats.FORMATS``, repeated so that ``--help`` need not import it."""
+MOVING = "4dgs"
+"""Name and suffix of the format of moving Gaussians."""
 
 
 def add_axes(parser: argparse.ArgumentParser) -> None:
     """Add the options of the up axis and the SH degree."""
     about = (
-        "up axis of the file, to which the scene is rotated (default: y for .spz and .glb, -y "
+        "up axis of the file, to which the scene is rotated (default: y for .spz, .glb and USD, -y "
         "for other formats); keep: no rotation"
     )
     parser.add_argument("--up", choices=(*AXES, "keep"), help=about)

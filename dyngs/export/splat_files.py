@@ -1,18 +1,21 @@
-"""Export of Gaussians: single times, sequences, streamed .sog levels, .glb bodies and tracks."""
+"""Export of Gaussians: single times, sequences, streamed .sog levels, .4dgs, .glb bodies and
+tracks."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from importlib import import_module
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from dyngs.core.errors import DyngsError
+from dyngs.core.conventions import SH_C0
+from dyngs.core.errors import DyngsError, format_count
 from dyngs.core.gaussians import Gaussians
 from dyngs.deform.bodies.field import BodyField, find_body_field
 from dyngs.deform.scene import field_scene_of
@@ -45,7 +48,9 @@ from dyngs.io.formats.similarity import (
 from dyngs.io.formats.sog import sog_parts
 from dyngs.io.formats.splat_file import (
     SplatFile,
+    from_linear,
     header_comments,
+    make_renderable,
     offset_notes,
     require_writable,
     unit_rotations,
@@ -437,6 +442,87 @@ def write_tracks(path: Path, tracks: Tracks) -> Path:
     with atomic_file(path) as temporary, open(temporary, "wb") as file:
         np.savez(file, **asdict(tracks))
     return path
+
+
+FOURDGS_SUFFIX = ".4dgs"
+FOURDGS_UP = "-y"
+FOURDGS_FPS = 30.0
+
+
+def write_4dgs(
+    opened: OpenedScene,
+    path: Path,
+    times: Sequence[float],
+    part: Part = "all",
+    how: WriteOptions = DEFAULT_WRITE_OPTIONS,
+) -> tuple[tuple[SplatFile, ...], tuple[str, ...]]:
+    """Write a run at T >= 1 times in [0, 1] as one .4dgs file, each time shown for 1/30 s.
+
+    Returns:
+        the intended content at each time, and notes about properties the format cannot store.
+
+    Raises:
+        DyngsError: a missing package, an empty part, or the file cannot be written.
+    """
+    collect_inputs(opened).require_output(path)
+    model, delta, files = _fourdgs(path)
+    scene = scene_part(opened.scene, part)
+    splats = tuple(splats_at(opened, scene, time, how) for time in times)
+    duration = len(times) / FOURDGS_FPS
+    samples = []
+    for i, splat in enumerate(splats):
+        gaussians = splat.gaussians
+        n = len(gaussians)
+        rgba = torch.cat([gaussians.base_rgb.clamp(0, 1), gaussians.opacities[:, None]], dim=1)
+        states = model.GaussianSet(
+            positions=gaussians.means.numpy(),
+            scales=gaussians.scales.numpy(),
+            rotations=unit_rotations(gaussians.quats).numpy()[:, [1, 2, 3, 0]],
+            colors=rgba.numpy(),
+            motions=np.zeros((n, 3), np.float32),
+            mu_t=np.full(n, i / FOURDGS_FPS, np.float32),
+            # standard deviation in time: Gaussians never fade
+            sigma_t=np.full(n, 1e4 * duration, np.float32),
+            win_lo=np.zeros(n, np.float32),
+            win_hi=np.full(n, duration, np.float32),
+        )
+        samples.append(delta.Sample(t0=i / FOURDGS_FPS, ids=np.arange(n), gaussians=states))
+    options = delta.KeyframeDeltaOptions(keyframe_every=8)
+    data = files.write_sequence(samples, duration, kd=options, profile="fine", library="dyngs")
+    with atomic_file(path) as temporary:
+        temporary.write_bytes(data)
+    notes = (
+        f"{format_count(len(times), 'time')}, each shown for 1/{FOURDGS_FPS:.0f} s",
+        *offset_notes(splats[0], "4dgs cannot state it"),
+    )
+    if any(bool(splat.gaussians.sh[:, 1:].any()) for splat in splats):
+        notes += ("SH degree reduced to 0: .4dgs stores no more for moving Gaussians",)
+    return splats, notes
+
+
+def read_4dgs_frame(path: Path, index: int) -> SplatFile:
+    """Read the Gaussians of a .4dgs written by dyngs at time index ``index``.
+
+    Raises:
+        DyngsError: a missing package, or non-finite values.
+    """
+    _, _, files = _fourdgs(path)
+    found = files.render_at(files.decode_streamed(path.read_bytes()), (index + 0.5) / FOURDGS_FPS)
+    sh = ((found["rgb"] - 0.5) / SH_C0)[:, None]
+    quats = found["rotations"][:, [3, 0, 1, 2]]
+    gaussians = from_linear(found["centers"], quats, found["scales"], found["opacity"], sh)
+    return make_renderable(SplatFile(gaussians), path, "error")
+
+
+def _fourdgs(path: Path) -> tuple[Any, Any, Any]:
+    names = ("model", "keyframe_delta_writer", "keyframe_delta_file")
+    try:
+        model, delta, files = (import_module(f"fourdgs.{name}") for name in names)
+    except ImportError:
+        raise DyngsError(
+            f"{path}: .4dgs needs the package fourdgs; run pip install 'dyngs[4dgs]'"
+        ) from None
+    return model, delta, files
 
 
 @torch.no_grad()

@@ -14,6 +14,7 @@ from dyngs.api.train import train
 from dyngs.config import Config
 from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError, format_one_line, wrap_read_errors
+from dyngs.io.child import package_parent
 from dyngs.io.containment import allow_run_links, run_links_allowed
 from dyngs.io.fields import read_limited
 from dyngs.io.write import write_text
@@ -74,8 +75,7 @@ def run_tasks(
         import ray  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise DyngsError("--ray needs the package ray; run pip install 'dyngs[ray]'") from None
-    # Ray processes import modules from the current folder of ray.init.
-    os.chdir(Path(__file__).absolute().parents[2])
+    os.chdir(package_parent())  # Ray's processes import modules from the current folder of ray.init
     try:
         ray.init()
     finally:

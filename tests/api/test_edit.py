@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -10,13 +11,14 @@ import pytest
 import torch
 from moving_scene import MOVING_ROWS, moved_x, write_moving_run
 from scaled_files import FAR, write_far_ply
-from splat_scenes import cloud
+from splat_scenes import cloud, readable
 
 from dyngs.api.edit import Edits, edit_scene
 from dyngs.core.errors import DyngsError
 from dyngs.export.edit.crop import Box, Sphere
 from dyngs.export.edit.frame import Frame, control_point_frame
-from dyngs.io.formats.formats import FORMATS, Format, read_splats, write_splats
+from dyngs.export.splat_files import read_4dgs_frame
+from dyngs.io.formats.formats import Format, read_splats, write_splats
 from dyngs.io.formats.splat_file import SplatFile
 
 HALF = Edits(frame=Frame(up=(0.0, 0.0, 1.0), origin=(0.5, 0.0, 0.0), scale=0.5))
@@ -33,19 +35,19 @@ def plain(tmp_path: Path) -> Path:
     ).path
 
 
-@pytest.mark.parametrize("kind", FORMATS, ids=lambda kind: kind.name)
+@pytest.mark.parametrize("kind", readable(), ids=lambda kind: kind.name)
 def test_a_frame_in_every_format_and_back(kind: Format, plain: Path, tmp_path: Path) -> None:
     before = plain.read_bytes()
     path = tmp_path / f"a{kind.suffixes[0]}"
     written = edit_scene(plain, path, HALF, tell=silent)
-    assert written.redrawn > (99 if kind.name in ("ply", "glb") else 15)
+    assert written.redrawn > (99 if kind.name in ("ply", "usd", "glb") else 15)
     assert read_splats(path).up == kind.up
     if not kind.stores_comments:
         return
     edit_scene(path, tmp_path / "back.ply", Edits(undo=True), tell=silent)
     back = read_splats(tmp_path / "back.ply")
     assert plain.read_bytes() == before
-    if kind.name in ("ply", "glb"):  # others change the order and round
+    if kind.name in ("ply", "usd", "glb"):  # others change the order and round
         for name, x in read_splats(plain).gaussians.tensors().items():
             got = getattr(back.gaussians, name)
             torch.testing.assert_close(
@@ -120,14 +122,30 @@ def test_a_moving_run(tmp_path: Path) -> None:
     assert not (tmp_path / "b.ply").exists()
 
 
+@pytest.mark.skipif(find_spec("fourdgs") is None, reason="needs fourdgs")
+def test_all_times_of_a_moving_run(tmp_path: Path) -> None:
+    path = tmp_path / "a.4dgs"
+    run = write_moving_run(tmp_path)
+    edits = Edits(region=Sphere((0.0, 0.0, 0.0), 0.2), frame=Frame(scale=3.0, up=(0.0, -1.0, 0.0)))
+    assert edit_scene(run, path, edits, tell=silent).redrawn > 40
+    assert len(read_4dgs_frame(path, 2).gaussians) == 3
+    assert float(read_4dgs_frame(path, 4).gaussians.means[0, 0]) == pytest.approx(
+        3 * float(moved_x((1,), 1.0)), abs=0.01
+    )
+
+
 def test_nothing_is_written_where_nothing_is_left(plain: Path, tmp_path: Path) -> None:
     far = Edits(region=Sphere((99.0, 0.0, 0.0), 1.0))
     with pytest.raises(DyngsError, match="--crop leaves none of 300 Gaussians; they lie between"):
         edit_scene(plain, tmp_path / "a.ply", far, tell=silent)
     edit_scene(plain, tmp_path / "a.ply", replace(far, outside=True), tell=silent)
     assert len(read_splats(tmp_path / "a.ply").gaussians) == 300
-    with pytest.raises(DyngsError, match="edits end in a file of Gaussians or a run"):
-        edit_scene(plain, tmp_path / "a.html", HALF, tell=silent)
+    for name, said in (
+        ("a.4dgs", "holds a scene that moves"),
+        ("a.html", "edits end in a file of Gaussians or a run"),
+    ):
+        with pytest.raises(DyngsError, match=said):
+            edit_scene(plain, tmp_path / name, HALF, tell=silent)
     with pytest.raises(DyngsError, match="--up auto needs the cameras"):
         edit_scene(plain, tmp_path / "b.ply", Edits(frame=Frame(up="auto")), tell=silent)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.ply", "plain.ply"]

@@ -339,8 +339,10 @@ def test_export_accepts_every_suffix_that_its_help_names(
     motions = re.search(r"motion file for a person: (.*?)--max", text, re.DOTALL)
     assert motions is not None
     others = {".kind", ".js", ".root", ".follow_links"}  # model.kind, three.js, data.root
-    found = set(re.findall(r"(?<=[a-z ])\.[a-z]\w+", text.replace(motions[1], ""))) - others
-    assert {".ply", ".spz", ".safetensors", ".html"} <= found
+    found = (
+        set(re.findall(r"(?<=[a-z ])\.(?:4dgs|[a-z]\w+)", text.replace(motions[1], ""))) - others
+    )
+    assert {".ply", ".spz", ".4dgs", ".safetensors", ".html"} <= found
     for suffix in found:
         arguments = argparse.Namespace(
             out=Path(f"x{suffix}"), format=None, times=None, motion=None, time=None, bodies=False

@@ -25,6 +25,7 @@ from scene_kinds import KINDS, onlooker, scene_of_kind
 from scipy.spatial.transform import Rotation, Slerp
 from splat_scenes import cloud
 
+from dyngs.cli import main
 from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, Lens, PointCloud
@@ -39,9 +40,11 @@ from dyngs.export.splat_files import (
     WriteOptions,
     choose_write_options,
     find_up_direction,
+    read_4dgs_frame,
     scene_part,
     splats_at,
     tracks_of,
+    write_4dgs,
     write_rigid_bodies,
     write_run_sequence,
     write_run_splats,
@@ -212,6 +215,26 @@ def test_a_file_of_tracks_holds_arrays_without_pickle(tmp_path: Path) -> None:
     with pytest.raises(DyngsError, match="not finite"):
         write_tracks(path, broken)
     assert path.read_bytes() == first
+
+
+def test_moving_files(
+    tmp_path: Path, near: OpenedScene, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("fourdgs")
+    times = [i / 9 for i in range(10)]  # more than one group of key frame and deltas
+    splats, _ = write_4dgs(near, tmp_path / "a.4dgs", times)
+    for i in (0, 3, 8, 9):
+        read = read_4dgs_frame(tmp_path / "a.4dgs", i).gaussians
+        meant = splats[i].gaussians
+        torch.testing.assert_close(read.means[:, 0], moved_x(ALL, times[i]), rtol=0, atol=0.01)
+        torch.testing.assert_close(read.base_rgb, meant.base_rgb.clamp(0, 1), rtol=0, atol=0.01)
+        torch.testing.assert_close(read.scales, meant.scales, rtol=0.02, atol=0)
+    run = str(near.path)
+    assert main(["export", run, "--times", "0:1:3", "--out", str(tmp_path / "b.4dgs")]) == 0
+    told = capsys.readouterr().out
+    assert "3 times, each shown for 1/30 s" in told
+    assert "drawn again" in told
+    assert main(["export", run, "--sh-degree", "3", "--out", str(tmp_path / "c.4dgs")]) == 2
 
 
 @pytest.fixture(scope="module")

@@ -123,7 +123,8 @@ def test_a_run_stopped_before_its_first_checkpoint_is_taken_up(
     for resumes in (False, True):
         out = tmp_path / str(resumes)
         out.mkdir()
-        shutil.copyfile(run_dir / "config.yaml", out / "config.yaml")
+        for name in ("asked.yaml", "config.yaml"):
+            shutil.copyfile(run_dir / name, out / name)
         (out / "log.jsonl").write_text((run_dir / "log.jsonl").read_text()[:50])
         before = _contents(out)
         with pytest.raises(DyngsError, match=r"before its first checkpoint.*--resume"):

@@ -20,7 +20,7 @@ from dyngs.export.cameras import write_cameras
 from dyngs.export.choose_path import PathOptions, choose_path
 from dyngs.export.html.page import write_page
 from dyngs.export.images import OutputOptions, write_path_images, write_split_images
-from dyngs.export.splat_files import write_run_sequence, write_run_splats
+from dyngs.export.splat_files import write_4dgs, write_run_sequence, write_run_splats
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
 from dyngs.runs.folder import collect_inputs
 from dyngs.runs.opened import open_run
@@ -86,6 +86,7 @@ def write_all(run: Path, out: Path) -> dict[str, Callable[[], object]]:
         "train": lambda: train(loaded.config.model_copy(update={"run": RunConfig(dir=out)})),
         "write_run_splats": lambda: write_run_splats(opened, out),
         "write_run_sequence": lambda: write_run_sequence(opened, out, (0.0, 1.0)),
+        "write_moving": lambda: write_4dgs(opened, out, (0.0, 1.0)),
         "write_scene_file": lambda: write_scene_file(run, out),
         "write_cameras": lambda: write_cameras(out, capture, capture.splits),
         "write_page": lambda: write_page(opened, out),

@@ -34,6 +34,7 @@ from dyngs.io.formats.splat_file import (
     with_sh_degree,
 )
 from dyngs.io.formats.spz import read_spz, write_spz
+from dyngs.io.formats.usd import read_usd, write_usd
 from dyngs.io.write import atomic_file
 
 
@@ -58,6 +59,7 @@ FORMATS = (
     Format("splat", (".splat",), "-y", 0, read_antimatter, write_antimatter, False, False),
     Format("sog", (".sog",), "-y", 3, read_sog, write_sog),
     Format("glb", (".glb",), "y", 3, read_gltf, write_gltf, False),
+    Format("usd", (".usdc", ".usd", ".usda"), "y", 4, read_usd, write_usd, False),
 )
 """All formats; a suffix that ends another one stands after it."""
 CHECKPOINT = Format("checkpoint", (".ckpt", ".pt"), "z", 4, read_checkpoint, None, False, False)
