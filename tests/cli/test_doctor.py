@@ -26,7 +26,7 @@ def test_doctor(capsys: Capture) -> None:
 
 
 def test_doctor_names_the_extras_of_optional_packages() -> None:
-    project = (Path(dyngs.__file__).resolve().parents[1] / "pyproject.toml").read_text()
+    project = (Path(__file__).parents[2] / "pyproject.toml").read_text()
     for name, extra in doctor._OPTIONAL.items():
         assert re.search(rf'^{extra} = \[.*"{name}>', project, re.MULTILINE), name
 

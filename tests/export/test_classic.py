@@ -89,3 +89,12 @@ def test_formats_without_a_render_mode_are_fitted(
         == 2
     )
     assert "--classic fits to training cameras" in capsys.readouterr().err
+
+
+def test_what_the_closed_form_cannot_fit_is_optimized(monkeypatch: pytest.MonkeyPatch) -> None:
+    own = cloud(200, 2)
+    own = own.replace(sh=own.sh + 0.1 * (torch.arange(9) > 0)[:, None])
+    optimized, _ = fit_classic(mip_file(own), AROUND, MIP.near, 0)
+    monkeypatch.setattr("dyngs.export.classic.GOOD_PSNR", 0.0)
+    closed_form, _ = fit_classic(mip_file(own), AROUND, MIP.near, 0)
+    assert difference(own, optimized) > difference(own, closed_form) + 0.5

@@ -96,8 +96,8 @@ class RunConfig(Section):
     )
     dir: Path | None = Field(
         default=None,
-        description="run folder; null: runs/CAPTURE-NAME, which continues a run of the same keys, or "
-        "else runs/CAPTURE-NAME-2, ...",
+        description="run folder; null: runs/CAPTURE-NAME, which continues a run of the same keys, "
+        "or else runs/CAPTURE-NAME-2, ...",
     )
     seed: int = Field(default=42, ge=0, lt=2**63, description="seed of all random numbers")
     threads: int = Field(
