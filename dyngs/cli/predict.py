@@ -13,7 +13,7 @@ examples:
   dyngs train human_predictor PEOPLE run.dir=runs/net     PEOPLE holds a capture in each folder
   dyngs predict runs/net captures/ann --out runs/ann
   dyngs predict runs/net captures/ann --out runs/ann --views f000_c00.png,f000_c03.png,f000_c06.png
-  dyngs train gps PEOPLE run.dir=runs/stereo              from two neighbouring views, without a body
+  dyngs train gps PEOPLE run.dir=runs/stereo             from two neighbouring views, without a body
   dyngs export runs/stereo --format network --out stereo.safetensors  the weights as one file
   dyngs predict stereo.safetensors captures/ann --out runs/two --views f000_c00.png,f000_c01.png
   dyngs predict gps captures/ann --out runs/two                     with the weights of dyngs
