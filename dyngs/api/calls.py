@@ -60,8 +60,10 @@ def train(
     Args:
         config: a ``Config``, a preset name or a YAML file; None: the preset that fits the data.
         data: folder, .zip or video (``data.root``), a ``Capture``, or keys of the section.
-        steps, minutes: ``train.steps`` and ``train.minutes``.
-        run_dir, device: ``run.dir`` and ``run.device``.
+        steps: ``train.steps``.
+        minutes: ``train.minutes``.
+        run_dir: ``run.dir``.
+        device: ``run.device``.
         resume: a run folder to continue, up to ``steps`` or ``minutes`` if given. Its config is
             fixed; pass ``losses`` again, and a ``Capture`` that you changed.
         losses: functions of a ``dyngs.LossInput`` that return a differentiable scalar tensor,

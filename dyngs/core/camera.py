@@ -81,7 +81,8 @@ class Cameras:
         Args:
             world_from_cam: (V, 4, 4) tensor, array or list.
             intrinsics: (3, 3) for all cameras, or (V, 3, 3), in pixels.
-            width, height: image size in pixels.
+            width: image width in pixels.
+            height: image height in pixels.
             convention: camera axes, "opencv" (x right, y down, z forward) or "opengl" (x right,
                 y up, z backward; also of Blender, NeRF and nerfstudio).
 

@@ -92,10 +92,13 @@ def compare(
     Args:
         capture: folder, in any format.
         models: presets or YAML files.
-        minutes, steps, max_mb: the budget, exactly one of them.
+        minutes: training time of each model. Give exactly one of the three limits.
+        steps: training steps of each model.
+        max_mb: size of each model in megabytes.
         out: output folder; None: compare/CAPTURE.
         split: held-out views to compare on.
-        threads, device: of each training.
+        threads: threads of each training.
+        device: device of each training.
         ray_cores: cores per model with Ray; None trains one model after the other.
         overrides: ``section.key=value`` for all models.
 

@@ -162,8 +162,9 @@ class Config(Section):
             same = config.replace(train={"steps": 60_000}, strategy={"kind": "mcmc"})
 
         Args:
-            changes, keys: values by dotted key, or nested mappings. A changed ``kind``
-                resets its section to the defaults of that kind.
+            changes: values by dotted key, or nested mappings. A changed ``kind`` resets its
+                section to the defaults of that kind.
+            keys: more of them.
 
         Raises:
             DyngsError: an unknown key or invalid value; the message has similar keys or the
