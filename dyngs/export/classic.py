@@ -132,15 +132,16 @@ def _optimize(
 ) -> Gaussians:
     """Return ``start`` after Adam steps on the difference between both renderings."""
     views = [cameras.select(i) for i in range(len(cameras))]
-    wanted = [render(own, view, source).rgb[0] for view in views]
     parameters = {name: getattr(start, name).clone().requires_grad_() for name in RATES}
     groups = [{"params": [parameters[name]], "lr": rate} for name, rate in RATES.items()]
     optimizer = torch.optim.Adam(groups, eps=1e-15)
     for step in range(NUM_STEPS):
-        view = step % len(views)
+        view = views[step % len(views)]
+        # rendered again each time: all images of a large capture take gigabytes
+        wanted = render(own, view, source).rgb[0]
         with torch.enable_grad():
-            image = render(start.replace(**parameters), views[view], target).rgb[0]
-            loss = l1_ssim_loss(image, wanted[view])
+            image = render(start.replace(**parameters), view, target).rgb[0]
+            loss = l1_ssim_loss(image, wanted)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
