@@ -19,7 +19,7 @@ from dyngs.training.events import Listener
 from dyngs.training.losses import AddedLoss, LossFunction
 
 _AFTER_READING = {"root", "downscale", "longest_side", "background", "cache_mb", "follow_links"}
-"""Keys of ``data`` that have an effect on a capture that was read already."""
+"""Keys of ``data`` that also apply to a capture that is already in memory."""
 
 
 def train(

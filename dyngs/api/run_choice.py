@@ -50,25 +50,23 @@ def _continue_run(folder: Path, config: Config) -> Config:
     done = checkpoint_step(checkpoint_paths(folder)[-1])
     steps = config.train.steps
     minutes = config.train.minutes
-    was = requested.train
+    former = requested.train
     different = differing_keys(with_length(requested, steps, minutes), config)
     if different:
         raise DyngsError(f"{folder} has a run with other values of {', '.join(different[:4])}")
     logging = {key: getattr(config.train, key) for key in LOGGING_KEYS}
     train = stored.train.model_copy(update=logging)
     continued = stored.model_copy(update={"train": train, "run": config.run})
-    if (steps, minutes) == (was.steps, was.minutes):
+    if (steps, minutes) == (former.steps, former.minutes):
         return continued
-    is_later = minutes is None or (was.minutes is not None and minutes > was.minutes)
-    if not is_later or steps < (was.steps if was.minutes is None else done):
-        raise DyngsError(f"{folder} has a run of {format_count(was.steps, 'step')}")
-    by_hand = f"(`dyngs train --resume {quote_path(folder)} train.steps={steps}` continues it)"
+    is_later = minutes is None or (former.minutes is not None and minutes > former.minutes)
+    if not is_later or steps < (former.steps if former.minutes is None else done):
+        raise DyngsError(f"{folder} has a run of {format_count(former.steps, 'step')}")
+    hint = f"(`dyngs train --resume {quote_path(folder)} train.steps={steps}` continues it)"
     if getattr(config.model, "pilot_runs", False):
-        raise DyngsError(
-            f"{folder} has a shorter run, for which its pilot runs were made {by_hand}"
-        )
-    if was.minutes is not None and stored.data.longest_side != requested.data.longest_side:
-        raise DyngsError(f"{folder} has a preview with smaller images {by_hand}")
+        raise DyngsError(f"{folder} has a shorter run, for which its pilot runs were made {hint}")
+    if former.minutes is not None and stored.data.longest_side != requested.data.longest_side:
+        raise DyngsError(f"{folder} has a preview with smaller images {hint}")
     if steps == done:
         return continued
     extend_config(stored, done, steps)  # raises if the run cannot be extended

@@ -165,7 +165,7 @@ class TrainingPage:
         self._text.content = "\n\n".join(f"{name}: **{x}**" for name, x in figures.items())
 
     def show_scene(self, scene: GaussianScene) -> None:
-        """Show the scene, which does not change for now, in all browsers, and in new ones first."""
+        """Show a constant scene in all browsers, also in those that connect later."""
         first = self.viewer.first
         self.viewer.show(first.with_scene(_shell(scene, first.background)))
 
