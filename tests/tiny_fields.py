@@ -144,7 +144,12 @@ def busy_config(capture: Path, run_dir: Path, kind: str, **model: object) -> Con
         model=DynamicModel.model_validate(options),
         init=RandomInit(num_random=60),
         strategy=DefaultStrategy(
-            start=1, stop=30_000, every=3, grad_threshold=1e-6, reset_every=5, max_gaussians=300
+            start=1,
+            stop=30_000,
+            every=3,
+            grad_threshold=1e-6,
+            reset_every=5,
+            max_gaussians=500 if kind == "gaussians_4d" else 300,
         ),
         train=TrainConfig(steps=24, log_every=1),
         run=RunConfig(dir=run_dir, threads=1),

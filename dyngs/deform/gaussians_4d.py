@@ -40,7 +40,7 @@ MIN_WEIGHT = 0.05  # Gaussians are not rendered where their opacity is below thi
 
 @dataclass(frozen=True)
 class LinearGaussians:
-    """M Gaussians that move along lines and fade; what 4D Gaussians are at all times."""
+    """M 4D Gaussians as 3D Gaussians that move along lines and fade."""
 
     gaussians: Gaussians  # at their mean times; the covariances are constant
     velocities: Tensor  # (M, 3) world units per clip
@@ -113,7 +113,8 @@ class Gaussians4D(DeformationField):
     @torch.no_grad()
     def linear(self, gaussians: Gaussians) -> LinearGaussians:
         """Return the motion and the conditional covariances of the canonical ``gaussians`` (M)."""
-        times, log_spans = self.parameters["times"][:, 0], self.parameters["log_spans"][:, 0]
+        times = self.parameters["times"][:, 0]
+        log_spans = self.parameters["log_spans"][:, 0]
         quats, log_scales, velocities, log_stds = condition_gaussians(
             gaussians.quats, self.parameters["right_quats"], gaussians.log_scales, log_spans
         )

@@ -220,8 +220,9 @@ def write_run_splats(
 ) -> WrittenFile:
     """Write a run at a time in [0, 1] as a file of Gaussians. The suffix selects the format.
 
-    Gaussians that do not exist at that time are left out. The 3D filter is fused, and colours of a network become spherical harmonics. The header stores
-    the render mode, and the time of a moving scene.
+    Gaussians that do not exist at that time are left out. The 3D filter is fused, and colours of a
+    network become spherical harmonics. The header stores the render mode, and the time of a moving
+    scene.
 
     Raises:
         DyngsError: an empty part, or an unknown suffix.
