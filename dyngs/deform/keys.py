@@ -59,7 +59,7 @@ class HexplaneField(FieldSection):
     depth: int = Field(default=1, ge=1, description="hidden layers of the decoder before the heads")
     separate_heads: bool = Field(
         default=False,
-        description="whether each attribute has a hidden layer of its own, as in 4DGS; false: shared",
+        description="whether each attribute reads its own hidden units only, as in 4DGS",
     )
     times_per_row: Positive = Field(
         default=2, description="training times per row of the time planes; 4DGS: 4"
@@ -70,8 +70,8 @@ class HexplaneField(FieldSection):
     )
     penalty_weights: tuple[float, float, float] = Field(
         default=(1e-4, 0.01, 1e-4),
-        description="weights of the smoothness of space planes, smoothness along time, and sparsity "
-        "of time planes; 4DGS: 2e-4, 1e-3, 1e-4 for real captures",
+        description="weights of the smoothness of space planes, smoothness along time, and "
+        "sparsity of time planes; 4DGS: 2e-4, 1e-3, 1e-4 for real captures",
     )
     lr_planes: Positive = Field(
         default=1.6e-3, description="learning rate of the planes, times the scene extent"
@@ -181,8 +181,8 @@ class DynamicModel(SceneModel):
     )
     static_decay: bool = Field(
         default=True,
-        description="whether the learning rate of positions decays from the first step; false: once "
-        "motion is trained (4DGS)",
+        description="whether the learning rate of positions also decays while the model is static; "
+        "4DGS: false",
     )
     motion_threshold: float = Field(
         default=0.04,
