@@ -6,9 +6,10 @@
 
 One row per variant, capture and seed is stored as FOLDER/results/CAPTURE_VARIANT_SEED.json; stored
 rows are not trained again. `--captures` takes names of CAPTURES (in the folder of --data) or
-NAME=PATH[,KEY=VALUE...], `--variants` names of VARIANTS or NAME=PRESET[,KEY=VALUE...]. Videos get
-poses once, by `dyngs data sfm`. `--speeds` times the models of each capture alternately, which
-`--jobs` does not disturb; run it when the machine has nothing else to do.
+NAME=PATH[,KEY=VALUE...], `--variants` names of VARIANTS and PUBLISHED or
+NAME=PRESET[,KEY=VALUE...]. Videos get poses once, by `dyngs data sfm`. `--speeds` times the models
+of each capture alternately, which `--jobs` does not disturb; run it when the machine has nothing
+else to do.
 
 What moves is scored on the same pixels for all variants: motion masks of the capture, else pixels
 of fixed cameras that differ from their median over time. One moving camera without masks has none.
@@ -57,6 +58,17 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "gaussians_4d_all": dynamic("gaussians_4d", "model.select_moving=false"),
     "hexplane": dynamic("hexplane"),
     "mlp": dynamic("mlp"),
+}
+# Published protocols, and single differences between them and the preset; only on request
+PUBLISHED: dict[str, tuple[str, ...]] = {
+    "4dgs": ("4dgs",),
+    "4dgs_detached": ("4dgs", "model.deform.position_gradient=false"),
+    "4dgs_selected": ("4dgs", "model.select_moving=true"),
+    "hexplane_attached": dynamic("hexplane", "model.deform.position_gradient=true"),
+    "hexplane_all": dynamic("hexplane", "model.select_moving=false"),
+    "deformable_3dgs": ("deformable_3dgs",),
+    "deformable_3dgs_small": ("deformable_3dgs", "init.num_random=5000"),
+    "mlp_all": dynamic("mlp", "model.select_moving=false"),
 }
 # Columns of the table: key of a row, heading, format
 COLUMNS = (
@@ -309,7 +321,7 @@ def main() -> None:
         return
     known = {name: (str(options.data / path), *words) for name, (path, words) in CAPTURES.items()}
     captures = dict(parse_named(word, known) for word in options.captures)
-    variants = dict(parse_named(word, VARIANTS) for word in options.variants)
+    variants = dict(parse_named(word, VARIANTS | PUBLISHED) for word in options.variants)
     folder = options.folder.absolute()
     rows = []
     for seed in options.seeds:
