@@ -8,6 +8,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from dataclasses import field as dataclass_field
 from typing import Any, TypeVar
 
 import torch
@@ -58,14 +59,36 @@ class FieldSetup:
     num_times: int
     num_moving: int
     extent: float  # scene extent, world units; learning rates are relative to it
+    num_sh_terms: int = 0  # of Gaussians whose SH coefficients may change over time; 0: none
 
     def normalize(self, means: Tensor) -> Tensor:
         """Normalise ``means`` (M, 3) to the box: [-1, 1] inside."""
         return (means - self.center) / self.half_size
 
 
+@dataclass(frozen=True)
+class MovingRows:
+    """The moving Gaussians among A rendered ones."""
+
+    means: Tensor  # (M, 3) canonical means of all moving Gaussians
+    visible: Tensor | None  # indices of the rendered ones among the M; None: all
+    rows: Tensor | None  # their rows among the A; None: all, in order
+
+
+@dataclass(frozen=True)
+class DeformedGaussians:
+    """A Gaussians at one time."""
+
+    gaussians: Gaussians
+    offsets: Offsets | None = None  # of the moving ones, if the field computes offsets
+    penalties: dict[str, Tensor] = dataclass_field(default_factory=dict[str, Tensor])
+
+
 class DeformationField:
-    """Offsets of canonical Gaussians over time; the identity before training."""
+    """Motion of canonical Gaussians over time; most fields compute offsets.
+
+    The identity before training.
+    """
 
     setup: FieldSetup
     parameters: Parameters
@@ -74,6 +97,8 @@ class DeformationField:
     """Moving Gaussians exist for a limited time and are updated only in steps that render them."""
     can_fade = False
     """Opacities may fade in or out, so that a Gaussian exists for a part of the clip."""
+    can_freeze = True
+    """Moving Gaussians become static where their motion is too small to be visible."""
 
     @property
     def num_values(self) -> int:
@@ -96,6 +121,18 @@ class DeformationField:
         ``rows`` (A,): compute only these rows, in this order; None: all.
         """
         raise NotImplementedError
+
+    def deform(
+        self, gaussians: Gaussians, moving: MovingRows, time: float, *, in_training: bool = False
+    ) -> DeformedGaussians:
+        """Return ``gaussians`` (A) with the moving ones at ``time``; in training with penalties."""
+        penalties: dict[str, Tensor] = {}
+        if in_training and moving.visible is None:
+            offsets, penalties = self.in_training(moving.means, time)
+        else:
+            offsets = self.offsets(moving.means, time, moving.visible)
+            penalties = self.penalties(time) if in_training else {}
+        return DeformedGaussians(apply_offsets(gaussians, offsets, moving.rows), offsets, penalties)
 
     def penalties(self, time: float) -> dict[str, Tensor]:
         """Return weighted regularisation terms of the field by name; some depend on ``time``."""

@@ -15,7 +15,15 @@ from dyngs.deform.bodies.field import BodyField
 from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.field import DeformationField, FieldSetup, Offsets, OuterField, select_rows
 from dyngs.deform.free import FreePrimitives
-from dyngs.deform.keys import ControlNodesField, DeformField, FreeField, HexplaneField, MlpField
+from dyngs.deform.gaussians_4d import Gaussians4D
+from dyngs.deform.keys import (
+    ControlNodesField,
+    DeformField,
+    FreeField,
+    Gaussians4DField,
+    HexplaneField,
+    MlpField,
+)
 from dyngs.deform.networks import Hexplane, Mlp
 from dyngs.gaussians import TopologyEdit
 from dyngs.gaussians.optimizer import Parameters
@@ -91,15 +99,18 @@ def create_field(
         MlpField: Mlp,
         ControlNodesField: ControlNodes,
         FreeField: FreePrimitives,
+        Gaussians4DField: Gaussians4D,
     }
     return kinds[type(options)](options, setup, generator)
 
 
-def num_values(options: DeformField, num_times: int, num_moving: int = 0) -> int:
+def num_values(
+    options: DeformField, num_times: int, num_moving: int = 0, num_sh_terms: int = 0
+) -> int:
     """Return the number of trained values of a field for ``num_moving`` Gaussians."""
-    setup = FieldSetup(
-        torch.zeros(3, device="cpu"), torch.ones(3, device="cpu"), num_times, num_moving, 1.0
-    )
+    center = torch.zeros(3, device="cpu")
+    half_size = torch.ones(3, device="cpu")
+    setup = FieldSetup(center, half_size, num_times, num_moving, 1.0, num_sh_terms)
     return create_field(options, setup, torch.Generator()).parameters.num_values
 
 

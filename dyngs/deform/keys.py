@@ -148,7 +148,34 @@ class FreeField(Section):
     )
 
 
-DeformField = HexplaneField | MlpField | ControlNodesField | FreeField
+class Gaussians4DField(Section):
+    """4D Gaussians: covariances over space and time (Yang et al. 2024)."""
+
+    kind: Literal["gaussians_4d"] = Field(
+        default="gaussians_4d",
+        description="each moving Gaussian has a covariance over space and time (4D Gaussians, Yang et al.)",
+    )
+    frequencies: int = Field(
+        default=2,
+        ge=0,
+        description="cosines in time of each spherical harmonic; 0: colours do not change; ignored by colour networks",
+    )
+    lr_times: Positive = Field(
+        default=0.01, description="learning rate of the mean times, in time steps of the capture"
+    )
+    lr_spans: Positive = Field(
+        default=5e-3, description="learning rate of the logarithms of the scales along time"
+    )
+    time_grad_threshold: Positive = Field(
+        default=5e-6,
+        description="mean gradient by the mean time, in clips, above which Gaussians are cloned or split",
+    )
+
+
+DeformField = HexplaneField | MlpField | ControlNodesField | FreeField | Gaussians4DField
+
+TIMED_FIELDS = FreeField, Gaussians4DField
+"""Fields of Gaussians that exist for a limited time."""
 
 
 MIN_STATIC_STEPS = 1000
@@ -189,6 +216,11 @@ class DynamicModel(SceneModel):
         ge=0,
         description="colour error (0 to 1) of the static model from which Gaussians are treated as moving",
     )
+    select_moving: bool = Field(
+        default=True,
+        description="whether only Gaussians that the static model renders badly enter the field; false: all, and "
+        "no rigid bodies are searched, as in 4DGS and Deformable-3DGS",
+    )
     num_random_moving: int = Field(
         default=4000,
         ge=0,
@@ -219,7 +251,7 @@ class DynamicModel(SceneModel):
 
     @property
     def num_added_for_motion(self) -> int:
-        if not isinstance(self.deform, FreeField):
+        if not isinstance(self.deform, TIMED_FIELDS):
             return self.num_random_moving
         return 2 * self.num_random_moving + COPIES_OF_MOVING
 
@@ -230,4 +262,4 @@ class DynamicModel(SceneModel):
     @property
     def bytes_per_moving_gaussian(self) -> int:
         # activations per Gaussian of space-time grids or networks
-        return 200 if isinstance(self.deform, (ControlNodesField, FreeField)) else 2000
+        return 200 if isinstance(self.deform, (ControlNodesField, *TIMED_FIELDS)) else 2000

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dyngs.core.state import Role, State, StateTensor, add_prefix, select_prefix
 from dyngs.core.tensor_checks import require_ascending, require_indices
-from dyngs.deform.field import DeformationField, Offsets, apply_offsets
+from dyngs.deform.field import DeformationField, DeformedGaussians, MovingRows
 from dyngs.deform.fields import field_state, restore_field
 from dyngs.deform.keys import DynamicModel
 from dyngs.gaussians import Gaussians, TopologyEdit
@@ -83,14 +83,10 @@ class DynamicScene(GaussianScene):
         if self.field is None or self.is_static:
             return GaussianTimeStep(apply_filter(self.gaussians, self.filter_std), now)
         part = self._visible_around(now)
-        offsets = self.field.offsets(part.moving_means, now, part.visible_rows)
-        return GaussianTimeStep(part.apply(offsets, self.field, now), now)
+        return GaussianTimeStep(part.deform(self.field, now).gaussians, now)
 
-    def in_training(
-        self, time: float, *, detach: bool
-    ) -> tuple[Gaussians, Offsets, dict[str, Tensor]]:
-        """Return the Gaussians at ``time``, the offsets of the moving ones, and the field's
-        penalties.
+    def in_training(self, time: float, *, detach: bool) -> DeformedGaussians:
+        """Return the Gaussians at ``time`` with offsets and penalties.
 
         With ``detach`` only the field gets gradients, not the canonical Gaussians.
         """
@@ -98,12 +94,7 @@ class DynamicScene(GaussianScene):
             raise ValueError("the scene has no deformation field")
         interval = 0 if self.masks is None else self.masks.interval(time)
         part = self._select_visible(self.gaussians.detach() if detach else self.gaussians, interval)
-        if part.visible_rows is None:
-            offsets, penalties = self.field.in_training(part.moving_means, time)
-        else:
-            offsets = self.field.offsets(part.moving_means, time, part.visible_rows)
-            penalties = self.field.penalties(time)
-        return part.apply(offsets, self.field, time), offsets, penalties
+        return part.deform(self.field, time, in_training=True)
 
     def apply_edit(self, edit: TopologyEdit) -> DynamicScene:
         position = torch.full((len(self),), -1, device=self.moving.device)
@@ -143,11 +134,12 @@ class DynamicScene(GaussianScene):
         means = gaussians.means.index_select(0, self.moving)
         if self.masks is None:
             rows = None if len(self.moving) == len(self) else self.moving
-            return _VisiblePart(gaussians, self.filter_std, means, None, rows)
+            return _VisiblePart(gaussians, self.filter_std, MovingRows(means, None, rows))
         active = self.masks.active(interval)
         std = None if self.filter_std is None else self.filter_std[active]
         visible_rows, rows = intersect_sorted(self.moving, active, len(self))
-        return _VisiblePart(gaussians.picked(active), std, means, visible_rows, rows)
+        moving = MovingRows(means, visible_rows, rows)
+        return _VisiblePart(gaussians.picked(active), std, moving)
 
 
 def field_scene_of(scene: Renderable) -> DynamicScene | None:
@@ -161,10 +153,12 @@ class _VisiblePart:
 
     gaussians: Gaussians  # A canonical Gaussians
     filter_std: Tensor | None  # (A,) or None
-    moving_means: Tensor  # (M, 3) canonical means of all moving Gaussians
-    visible_rows: Tensor | None  # indices of the visible ones among the M; None: all
-    rows: Tensor | None  # their rows among the A; None: all, in order
+    moving: MovingRows
 
-    def apply(self, offsets: Offsets, field: DeformationField, time: float) -> Gaussians:
-        now = apply_filter(apply_offsets(self.gaussians, offsets, self.rows), self.filter_std)
-        return field.apply_shading(now, self.rows, self.visible_rows, time)
+    def deform(
+        self, field: DeformationField, time: float, *, in_training: bool = False
+    ) -> DeformedGaussians:
+        now = field.deform(self.gaussians, self.moving, time, in_training=in_training)
+        filtered = apply_filter(now.gaussians, self.filter_std)
+        shaded = field.apply_shading(filtered, self.moving.rows, self.moving.visible, time)
+        return replace(now, gaussians=shaded)
