@@ -218,8 +218,8 @@ class DynamicModel(SceneModel):
     )
     select_moving: bool = Field(
         default=True,
-        description="whether only Gaussians that the static model renders badly enter the field; false: all, and "
-        "no rigid bodies are searched, as in 4DGS and Deformable-3DGS",
+        description="whether only Gaussians that the static model renders badly enter the field; "
+        "false: all, and no rigid bodies are searched, as in 4DGS and Deformable-3DGS",
     )
     num_random_moving: int = Field(
         default=4000,

@@ -186,6 +186,19 @@ def test_motion_sparsity_is_the_mean_length_in_extents() -> None:
     assert begun(gaussians).time_step(1.0, FINE + 1).penalties == {}
 
 
+def test_all_gaussians_may_enter_the_field() -> None:
+    """Without differences from the static model, and without a search for rigid bodies."""
+
+    def searched(_: Gaussians) -> None:
+        raise AssertionError
+
+    gaussians = flat_cloud()
+    run = new_run(gaussians, select_moving=False)
+    run.training.capture = replace(run.training.capture, frame_stack=searched)
+    assert run.grow(FINE) is not None
+    assert run.scene.moving.tolist() == list(range(len(gaussians)))
+
+
 def test_noise_of_training_times_falls_to_zero_in_half_of_the_run() -> None:
     run = begun(flat_cloud())
     move(run, torch.ones(9))  # from -1 at time 0 to 1 at time 1
