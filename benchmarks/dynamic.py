@@ -7,10 +7,11 @@
 
 One row per variant, capture and seed is stored as FOLDER/results/CAPTURE_VARIANT_SEED.json; stored
 rows are not trained again. `--captures` takes names of CAPTURES (in the folder of --data) or
-NAME=PATH[,KEY=VALUE...], `--variants` names of VARIANTS or NAME=PRESET[,KEY=VALUE...]. Videos get
-poses once, by `dyngs data sfm`. `--speeds` times the models of each capture alternately, which
-`--jobs` does not disturb; run it when the machine has nothing else to do. `--store` keeps the rows
-for docs/results.md, which `python benchmarks/results.py write` writes.
+NAME=PATH[,KEY=VALUE...], `--variants` names of VARIANTS and PUBLISHED or
+NAME=PRESET[,KEY=VALUE...]. Videos get poses once, by `dyngs data sfm`. `--speeds` times the models
+of each capture alternately, which `--jobs` does not disturb; run it when the machine has nothing
+else to do. `--store` keeps the rows for docs/results.md, which `python benchmarks/results.py
+write` writes.
 
 `--films` writes FOLDER/films/CAPTURE_VARIANT.mp4 for the first seed: the camera of the first held-out
 view over time, truth left, rendering right; a bar below marks frames that were held out.
@@ -74,6 +75,17 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "gaussians_4d_all": dynamic("gaussians_4d", "model.select_moving=false"),
     "hexplane": dynamic("hexplane"),
     "mlp": dynamic("mlp"),
+}
+# Published protocols, and single differences between them and the preset; only on request
+PUBLISHED: dict[str, tuple[str, ...]] = {
+    "4dgs": ("4dgs",),
+    "4dgs_detached": ("4dgs", "model.deform.position_gradient=false"),
+    "4dgs_selected": ("4dgs", "model.select_moving=true"),
+    "hexplane_attached": dynamic("hexplane", "model.deform.position_gradient=true"),
+    "hexplane_all": dynamic("hexplane", "model.select_moving=false"),
+    "deformable_3dgs": ("deformable_3dgs",),
+    "deformable_3dgs_small": ("deformable_3dgs", "init.num_random=5000"),
+    "mlp_all": dynamic("mlp", "model.select_moving=false"),
 }
 
 
@@ -330,7 +342,7 @@ def main() -> None:
         return
     known = {name: (str(options.data / path), *words) for name, (path, words) in CAPTURES.items()}
     captures = dict(parse_named(word, known) for word in options.captures)
-    variants = dict(parse_named(word, VARIANTS) for word in options.variants)
+    variants = dict(parse_named(word, VARIANTS | PUBLISHED) for word in options.variants)
     folder = options.folder.absolute()
     rows = []
     for seed in options.seeds:
