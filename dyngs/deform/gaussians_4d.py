@@ -21,6 +21,7 @@ from dyngs.deform.field import (
     DeformedGaussians,
     FieldSetup,
     MovingRows,
+    OpacityWindow,
     select_rows,
 )
 from dyngs.deform.free import FreeInitialization
@@ -29,7 +30,7 @@ from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.densify import SPLIT_SHRINK
 from dyngs.gaussians.optimizer import Parameters
 from dyngs.ops.quaternions import identity_quat, quat_product, unit_quats
-from dyngs.ops.slicing import slice_gaussians
+from dyngs.ops.slicing import condition_gaussians, slice_gaussians
 
 LR_QUATS = 1e-3  # learning rate of the right quaternions, that of 3DGS for rotations
 LR_SH = 0.0025 / 20  # learning rate of SH coefficients over time, that of 3DGS above degree 0
@@ -89,6 +90,18 @@ class Gaussians4D(DeformationField):
         for name, values in now.tensors().items():
             tensors[name] = tensors[name].index_copy(0, moving.rows, values)
         return DeformedGaussians(Gaussians(**tensors))
+
+    @torch.no_grad()
+    def opacity_window(self, gaussians: Gaussians, time: float) -> OpacityWindow:
+        log_spans = self.parameters["log_spans"][:, 0]
+        log_stds = condition_gaussians(
+            gaussians.quats, self.parameters["right_quats"], gaussians.log_scales, log_spans
+        )[3].double()
+        elapsed = time - self.parameters["times"][:, 0].double()
+        # limits keep all factors finite; the density is 0 at 40 standard deviations
+        squares = (elapsed * (-log_stds).exp()).square().clamp_max(1600)
+        curvature = (squares - 1) * (-0.5 * squares - 2 * log_stds.clamp_min(-300)).exp()
+        return OpacityWindow(curvature, log_spans.double())
 
     def _colours(self, sh: Tensor, elapsed: Tensor, visible: Tensor | None) -> Tensor:
         """Return SH coefficients (A, K, 3), ``elapsed`` (A, 1) clips after the mean times."""

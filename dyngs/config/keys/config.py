@@ -56,9 +56,14 @@ class PruneConfig(Section):
     fraction: float = Field(
         default=0.0, ge=0, lt=1, description="fraction of the Gaussians to remove; 0: none"
     )
-    score: Literal["variation", "sensitivity", "contribution"] = Field(
+    score: Literal["sensitivity", "contribution", "temporal", "variation"] = Field(
         default="sensitivity",
-        description="importance score; the Gaussians with the lowest scores are removed",
+        description="importance score (`dyngs docs motion`); the Gaussians with the lowest scores are removed",
+    )
+    signed: bool = Field(
+        default=False,
+        description="whether `temporal` and `variation` take the second derivative of the opacity with its sign; "
+        "false: its magnitude",
     )
     mask_times: int = Field(
         default=0,
