@@ -128,6 +128,7 @@ def select_highest(scores: Tensor, fraction: float) -> Tensor:
 
 # Numbers of training cameras and times whose pairs are scored in dynamic scenes
 MOVING_VIEWS, MOVING_TIMES = 8, 24
+# Most training cameras of a static scene that are scored, and from which masks are computed
 STILL_VIEWS = 100
 PROBED_VIEWS = 16  # Number of training images on which the loss is measured
 MASKED_BELOW = 0.5
@@ -229,9 +230,7 @@ def scoring_views(
         times = [scene.times[i] for i in evenly_spaced(len(scene.times), MOVING_TIMES)]
     cameras = distinct_cameras(trainer.images.cameras(), STILL_VIEWS if scene.is_static else most)
     groups = [(None, cameras)] if scene.is_static else [(time, cameras) for time in times]
-    return ScoringViews(
-        scene, groups, trainer.model.options, background_colour(trainer.background)
-    )
+    return ScoringViews(scene, groups, trainer.model.options, background_colour(trainer.background))
 
 
 def training_views(trainer: GaussianTrainer, scene: GaussianScene) -> ScoringViews:
@@ -276,16 +275,16 @@ def mean_psnr(
 
 
 def _masks(trainer: GaussianTrainer, scene: GaussianScene, kept: Tensor | None) -> VisibilityMasks:
-    """Return at which of evenly spaced key times each Gaussian kept is seen from any of the
-    survey's cameras."""
+    """Return which of the Gaussians ``kept`` are visible from any training camera at evenly spaced
+    key times, or around them."""
     options = trainer.config.prune
     last = len(scene.times) - 1
     count = min(options.mask_times, len(scene.times))
     times = [scene.times[round(k * last / (count - 1))] for k in range(count)]
-    fractions = measure_importance(scoring_views(trainer, scene, times), slopes=False).fractions
-    seen = fractions > MASKED_BELOW
+    seen = measure_contributions(scoring_views(trainer, scene, times, STILL_VIEWS)) > MASKED_BELOW
     moved = field_scene_of(scene)
-    if moved is not None and moved.field is not None and moved.field.can_fade:
+    can_fade = moved is not None and moved.field is not None and moved.field.can_fade
+    if options.mask_between and can_fade:
         seen |= visible_between_times(scene, times, trainer.model.options.alpha_min).to(seen.device)
     return VisibilityMasks.pack(tuple(times), seen if kept is None else seen[:, kept])
 

@@ -161,6 +161,11 @@ class DeformationField:
         None: opacities do not change, or have no closed form."""
         return None
 
+    def lifetimes(self, gaussians: Gaussians) -> Tensor | None:
+        """Return the first and the last time (M, 2) at which each of the moving ``gaussians`` is
+        drawn; None: any time."""
+        return None
+
     def penalties(self, time: float) -> dict[str, Tensor]:
         """Return weighted regularisation terms of the field by name; some depend on ``time``."""
         return {}

@@ -35,6 +35,7 @@ from dyngs.ops.slicing import condition_gaussians, slice_gaussians
 LR_QUATS = 1e-3  # learning rate of the right quaternions, that of 3DGS for rotations
 LR_SH = 0.0025 / 20  # learning rate of SH coefficients over time, that of 3DGS above degree 0
 LR_DECAY = 0.1  # ratio of the last to the first learning rate
+MIN_WEIGHT = 0.05  # Gaussians are not drawn at times with a lower density, relative to the mean's
 MIN_SPAN = 0.25  # smallest standard deviation along time, in time steps
 
 
@@ -90,6 +91,7 @@ class Gaussians4D(DeformationField):
             log_spans[:, 0],
             own.logit_opacities,
             time,
+            MIN_WEIGHT,
         )
         now = Gaussians(*sliced, self._colours(own.sh, time - times, moving.visible))
         if moving.rows is None:
@@ -100,16 +102,26 @@ class Gaussians4D(DeformationField):
         return DeformedGaussians(Gaussians(**tensors))
 
     @torch.no_grad()
-    def opacity_window(self, gaussians: Gaussians, time: float) -> OpacityWindow:
+    def lifetimes(self, gaussians: Gaussians) -> Tensor:
+        # A little longer, because slicing rounds otherwise.
+        reach = (1 + 1e-4) * math.sqrt(-2 * math.log(MIN_WEIGHT)) * self._log_stds(gaussians).exp()
+        return self.parameters["times"].double() + torch.stack([-reach, reach], dim=1)
+
+    def _log_stds(self, gaussians: Gaussians) -> Tensor:
+        """Return the logarithms (M,) of the standard deviations of time, float64."""
+        right_quats = self.parameters["right_quats"]
         log_spans = self.parameters["log_spans"][:, 0]
-        log_stds = condition_gaussians(
-            gaussians.quats, self.parameters["right_quats"], gaussians.log_scales, log_spans
-        )[3].double()
+        shapes = gaussians.quats, right_quats, gaussians.log_scales, log_spans
+        return condition_gaussians(*shapes)[3].double()
+
+    @torch.no_grad()
+    def opacity_window(self, gaussians: Gaussians, time: float) -> OpacityWindow:
+        log_stds = self._log_stds(gaussians)
         elapsed = time - self.parameters["times"][:, 0].double()
         # limits keep all factors finite; the density is 0 at 40 standard deviations
         squares = (elapsed * (-log_stds).exp()).square().clamp_max(1600)
         curvature = (squares - 1) * (-0.5 * squares - 2 * log_stds.clamp_min(-300)).exp()
-        return OpacityWindow(curvature, log_spans.double())
+        return OpacityWindow(curvature, self.parameters["log_spans"][:, 0].double())
 
     def _colours(self, sh: Tensor, elapsed: Tensor, visible: Tensor | None) -> Tensor:
         """Return SH coefficients (A, K, 3), ``elapsed`` (A, 1) clips after the mean times."""

@@ -71,6 +71,10 @@ class PruneConfig(Section):
         description="number of key times of the visibility masks (4DGS-1K), which skip Gaussians "
         "that hardly contribute at a time; 0 or 1: no masks",
     )
+    mask_between: bool = Field(
+        default=True,
+        description="whether masks keep Gaussians that are visible only between key times; false: as in 4DGS-1K",
+    )
     steps: int = Field(default=2000, ge=1, description="number of fine-tuning steps after pruning")
 
     @property
