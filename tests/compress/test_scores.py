@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from camera_rings import ring_of
 from tiny_fields import cloud, stirred_field, tiny_setup
 from torch import Tensor
 
-from dyngs.compress.stage import VOLUME_POWER, log_temporal_scores
+from dyngs.compress.stage import log_temporal_scores
 from dyngs.deform.field import DeformationField, Offsets
 from dyngs.deform.fields import WindowedField
 from dyngs.deform.gaussians_4d import Gaussians4D
@@ -70,11 +71,12 @@ def relative_opacity(field: DeformationField, times: Tensor) -> Tensor:
     if isinstance(field, Gaussians4D):
         elapsed = times - field.parameters["times"].detach()[:, 0].double()
         return (-0.5 * elapsed.square() / variances(field)).exp()
+    now: Any = times
     if isinstance(field, WindowedField):
-        offsets = field.modify(Offsets(gaussians.means), gaussians.means, times, None)  # type: ignore[arg-type]
-        window = offsets.logit_opacities
+        offsets = field.modify(Offsets(gaussians.means), gaussians.means, now, None)
     else:
-        window = field.offsets(gaussians.means, times[:, None]).logit_opacities  # type: ignore[arg-type]
+        offsets = field.offsets(gaussians.means, now[:, None])
+    window = offsets.logit_opacities
     assert window is not None
     logits = gaussians.logit_opacities.double()
     return (logits + window).sigmoid() / logits.sigmoid()
@@ -110,9 +112,9 @@ def test_the_sign_decides_what_counts_as_steady() -> None:
     for signed, moving in ((True, 1 + math.exp(8)), (False, 1 + math.exp(-8))):
         sums = torch.tensor([moving] * COUNT + [2.0] * NUM_STATIC, dtype=torch.float64).log()
         found = log_temporal_scores(scene, signed=signed)
-        torch.testing.assert_close(found, sums + VOLUME_POWER * log_volumes, rtol=1e-5, atol=1e-5)
+        torch.testing.assert_close(found, sums + 0.1 * log_volumes, rtol=1e-5, atol=1e-5)
     # in seconds of a clip of two, x is a quarter
-    slower = log_temporal_scores(scene, 2.0, signed=True)[0] - VOLUME_POWER * log_volumes[0]
+    slower = log_temporal_scores(scene, 2.0, signed=True)[0] - 0.1 * log_volumes[0]
     assert float(slower) == pytest.approx(math.log(1 + math.exp(2)), rel=1e-5)
 
 
@@ -127,7 +129,7 @@ def test_extreme_variances_have_finite_scores(signed: bool) -> None:
     scene = scene_of(field)
     found = log_temporal_scores(scene, signed=signed)
     assert bool(found.isfinite().all())
-    sums = found[:COUNT] - VOLUME_POWER * (moving_gaussians().log_scales.sum(1) + log_stds)
+    sums = found[:COUNT] - 0.1 * (moving_gaussians().log_scales.sum(1) + log_stds)
     # without the sign no short-lived Gaussian exceeds those that are always there
     assert (float(sums.max()) > math.log(2 * len(scene.times)) + 1e-4) is signed
 
@@ -143,7 +145,8 @@ def test_images_need_only_the_gaussians_of_their_time(is_masked: bool) -> None:
     with torch.no_grad():
         assert len(scene.drawing_step(1.0).gaussians) < len(scene.time_step(1.0).gaussians)
         for time in (0.0, 0.5, 1.0):
-            every, some = scene.time_step(time), scene.drawing_step(time)
+            every = scene.time_step(time)
+            some = scene.drawing_step(time)
             assert len(some.gaussians) == int((every.gaussians.logit_opacities > -9e3).sum())
             wanted = scene.render(camera, every).rgb
             torch.testing.assert_close(scene.render(camera, time).rgb, wanted)

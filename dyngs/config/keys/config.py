@@ -58,12 +58,13 @@ class PruneConfig(Section):
     )
     score: Literal["sensitivity", "contribution", "temporal", "variation"] = Field(
         default="sensitivity",
-        description="importance score (`dyngs docs motion`); the Gaussians with the lowest scores are removed",
+        description="importance score (`dyngs docs motion`); the Gaussians with the lowest scores "
+        "are removed",
     )
     signed: bool = Field(
         default=False,
-        description="whether `temporal` and `variation` take the second derivative of the opacity with its sign; "
-        "false: its magnitude",
+        description="whether `temporal` and `variation` use the second derivative of the opacity "
+        "with its sign; false: its magnitude",
     )
     mask_times: int = Field(
         default=0,
@@ -73,7 +74,8 @@ class PruneConfig(Section):
     )
     mask_between: bool = Field(
         default=True,
-        description="whether masks keep Gaussians that are visible only between key times; false: as in 4DGS-1K",
+        description="whether masks keep Gaussians that are visible only between key times; false: "
+        "as in 4DGS-1K",
     )
     steps: int = Field(default=2000, ge=1, description="number of fine-tuning steps after pruning")
 
