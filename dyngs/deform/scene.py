@@ -12,6 +12,7 @@ from dyngs.core.state import Role, State, StateTensor, add_prefix, select_prefix
 from dyngs.core.tensor_checks import require_ascending, require_indices
 from dyngs.deform.field import DeformationField, DeformedGaussians, MovingRows
 from dyngs.deform.fields import field_state, restore_field
+from dyngs.deform.gaussians_4d import Gaussians4D
 from dyngs.deform.keys import DynamicModel
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.filters import apply_filter, filter_state, restore_filter
@@ -131,6 +132,17 @@ class DynamicScene(GaussianScene):
             masks=None if self.masks is None else self.masks.select(edit.source),
             filter_std=None if self.filter_std is None else edit.apply(self.filter_std),
         )
+
+    def drawing_state(self) -> State:
+        """Return the tensors needed for rendering, with equivalent rotations of 4D Gaussians."""
+        state = super().drawing_state()
+        if isinstance(self.field, Gaussians4D) and len(self.moving):
+            quats = self.gaussians.quats.detach()
+            left, right = self.field.storage_quats(quats[self.moving])
+            left = quats.index_copy(0, self.moving, left)
+            state["gaussians.quats"] = StateTensor(left, Role.PER_GAUSSIAN)
+            state["model.field.learned.right_quats"] = StateTensor(right, Role.PER_MOVING)
+        return state
 
     def _model_state(self) -> State:
         state = filter_state(self.filter_std) | times_state(self.training_times)
