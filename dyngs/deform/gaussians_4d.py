@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -21,6 +21,7 @@ from dyngs.deform.field import (
     DeformedGaussians,
     FieldSetup,
     MovingRows,
+    OpacityWindow,
     select_rows,
 )
 from dyngs.deform.free import FreeInitialization
@@ -29,12 +30,23 @@ from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.densify import SPLIT_SHRINK
 from dyngs.gaussians.optimizer import Parameters
 from dyngs.ops.quaternions import identity_quat, quat_product, unit_quats
-from dyngs.ops.slicing import slice_gaussians
+from dyngs.ops.slicing import condition_gaussians, slice_gaussians
 
 LR_QUATS = 1e-3  # learning rate of the right quaternions, that of 3DGS for rotations
 LR_SH = 0.0025 / 20  # learning rate of SH coefficients over time, that of 3DGS above degree 0
 LR_DECAY = 0.1  # ratio of the last to the first learning rate
 MIN_SPAN = 0.25  # smallest standard deviation along time, in time steps
+MIN_WEIGHT = 0.05  # Gaussians are not rendered where their opacity is below this fraction
+
+
+@dataclass(frozen=True)
+class LinearGaussians:
+    """M 4D Gaussians as 3D Gaussians that move along lines and fade."""
+
+    gaussians: Gaussians  # at their mean times; the covariances are constant
+    velocities: Tensor  # (M, 3) world units per clip
+    times: Tensor  # (M,) mean times, in clips
+    log_stds: Tensor  # (M,) logarithms of the standard deviations of the opacity over time
 
 
 class Gaussians4D(DeformationField):
@@ -89,6 +101,7 @@ class Gaussians4D(DeformationField):
             log_spans[:, 0],
             own.logit_opacities,
             time,
+            MIN_WEIGHT,
         )
         now = Gaussians(*sliced, self._colours(own.sh, time - times, moving.visible))
         if moving.rows is None:
@@ -97,6 +110,34 @@ class Gaussians4D(DeformationField):
         for name, values in now.tensors().items():
             tensors[name] = tensors[name].index_copy(0, moving.rows, values)
         return DeformedGaussians(Gaussians(**tensors))
+
+    @torch.no_grad()
+    def linear(self, gaussians: Gaussians) -> LinearGaussians:
+        """Return the motion and the conditional covariances of the canonical ``gaussians`` (M)."""
+        times = self.parameters["times"][:, 0]
+        log_spans = self.parameters["log_spans"][:, 0]
+        quats, log_scales, velocities, log_stds = condition_gaussians(
+            gaussians.quats, self.parameters["right_quats"], gaussians.log_scales, log_spans
+        )
+        conditioned = gaussians.replace(quats=quats, log_scales=log_scales)
+        return LinearGaussians(conditioned, velocities, times, log_stds)
+
+    @torch.no_grad()
+    def lifetimes(self, gaussians: Gaussians) -> Tensor:
+        motion = self.linear(gaussians)
+        # A little longer, because slicing rounds otherwise.
+        reach = (1 + 1e-4) * math.sqrt(-2 * math.log(MIN_WEIGHT)) * motion.log_stds.double().exp()
+        return motion.times.double()[:, None] + torch.stack([-reach, reach], dim=1)
+
+    @torch.no_grad()
+    def opacity_window(self, gaussians: Gaussians, time: float) -> OpacityWindow:
+        motion = self.linear(gaussians)
+        log_stds = motion.log_stds.double()
+        elapsed = time - motion.times.double()
+        # limits keep all factors finite; the density is 0 at 40 standard deviations
+        squares = (elapsed * (-log_stds).exp()).square().clamp_max(1600)
+        curvature = (squares - 1) * (-0.5 * squares - 2 * log_stds.clamp_min(-300)).exp()
+        return OpacityWindow(curvature, self.parameters["log_spans"][:, 0].double())
 
     def _colours(self, sh: Tensor, elapsed: Tensor, visible: Tensor | None) -> Tensor:
         """Return SH coefficients (A, K, 3), ``elapsed`` (A, 1) clips after the mean times."""
@@ -107,6 +148,25 @@ class Gaussians4D(DeformationField):
             phase = (2 * math.pi * order) * elapsed[:, :, None]
             sh = torch.addcmul(sh, phase.cos(), amplitude)
         return sh
+
+    @torch.no_grad()
+    def storage_quats(self, quats: Tensor) -> tuple[Tensor, Tensor]:
+        """Return equivalent left and right rotations (M, 4) with the largest part of q_l first.
+
+        Storage turns other Gaussians by halves, which changes q_l v q_r. But q_l u v conj(u) q_r is
+        the same Gaussian for each unit u of the quaternions.
+        """
+        left = unit_quats(quats)
+        right = unit_quats(self.parameters["right_quats"])
+        units = torch.eye(4, device=quats.device)[left.abs().argmax(1)]
+        forms = quat_product(left, units), quat_product(units, right)
+        left, right = (torch.where(x[:, :1] < 0, -x, x) for x in forms)
+        return left, right
+
+    @property
+    def num_waves(self) -> int:
+        """Number of cosines in time of each spherical harmonic."""
+        return self.options.frequencies if "sh_time" in self.parameters else 0
 
     @property
     def time_gradient(self) -> Tensor:

@@ -182,8 +182,8 @@ class DynamicTraining(SceneTraining[DynamicScene]):
     def split_in_time(
         self, scene: DynamicScene, result: EditResult, generator: torch.Generator
     ) -> EditResult:
-        is_split = isinstance(scene.field, Gaussians4D) and "log_scales" in result.changes
-        if not is_split or result.edit is None:
+        is_split = isinstance(scene.field, Gaussians4D) and "means" in result.changes
+        if not is_split or result.edit is None or scene.is_static:
             return result
         position = torch.full((len(scene),), -1, device=scene.device)
         position[scene.moving] = torch.arange(len(scene.moving), device=scene.device)
