@@ -8,11 +8,13 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from dataclasses import field as dataclass_field
 from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+from torch.nn.functional import logsigmoid
 
 from dyngs.core.initialisation import glorot
 from dyngs.core.state import State, add_prefix, move_to_device, select_prefix
@@ -58,14 +60,57 @@ class FieldSetup:
     num_times: int
     num_moving: int
     extent: float  # scene extent, world units; learning rates are relative to it
+    num_sh_terms: int = 0  # of Gaussians whose SH coefficients may change over time; 0: none
 
     def normalize(self, means: Tensor) -> Tensor:
         """Normalise ``means`` (M, 3) to the box: [-1, 1] inside."""
         return (means - self.center) / self.half_size
 
 
+@dataclass(frozen=True)
+class MovingRows:
+    """The moving Gaussians among A rendered ones."""
+
+    means: Tensor  # (M, 3) canonical means of all moving Gaussians
+    visible: Tensor | None  # indices of the rendered ones among the M; None: all
+    rows: Tensor | None  # their rows among the A; None: all, in order
+
+
+@dataclass(frozen=True)
+class DeformedGaussians:
+    """A Gaussians at one time."""
+
+    gaussians: Gaussians
+    offsets: Offsets | None = None  # of the moving ones, if the field computes offsets
+    penalties: dict[str, Tensor] = dataclass_field(default_factory=dict[str, Tensor])
+
+
+@dataclass(frozen=True)
+class OpacityWindow:
+    """Opacities of M moving Gaussians over time, in closed form; float64."""
+
+    # (M,) second derivative at a time, per squared clip, of the opacity over that of an open window
+    curvature: Tensor
+    log_spans: Tensor  # (M,) logarithms of the lifetimes, in clips
+
+
+def logit_curvature(logits: Tensor, window: Tensor) -> Tensor:
+    """Return the second derivative (M,) of sigmoid(L + w) / sigmoid(L), for ``OpacityWindow``.
+
+    ``logits`` (M,) are L; ``window`` (3, M) is w with its first and second derivative.
+    """
+    value, slope, bend = window
+    logits = logits.double()
+    opacity = (logits + value).sigmoid()
+    relative = (logsigmoid(logits + value) - logsigmoid(logits)).exp()
+    return relative * (1 - opacity) * (bend + (1 - 2 * opacity) * slope.square())
+
+
 class DeformationField:
-    """Offsets of canonical Gaussians over time; the identity before training."""
+    """Motion of canonical Gaussians over time; most fields compute offsets.
+
+    The identity before training.
+    """
 
     setup: FieldSetup
     parameters: Parameters
@@ -74,6 +119,8 @@ class DeformationField:
     """Moving Gaussians exist for a limited time and are updated only in steps that render them."""
     can_fade = False
     """Opacities may fade in or out, so that a Gaussian exists for a part of the clip."""
+    can_freeze = True
+    """Moving Gaussians become static where their motion is too small to be visible."""
 
     @property
     def num_values(self) -> int:
@@ -96,6 +143,28 @@ class DeformationField:
         ``rows`` (A,): compute only these rows, in this order; None: all.
         """
         raise NotImplementedError
+
+    def deform(
+        self, gaussians: Gaussians, moving: MovingRows, time: float, *, in_training: bool = False
+    ) -> DeformedGaussians:
+        """Return ``gaussians`` (A) with the moving ones at ``time``; in training with penalties."""
+        penalties: dict[str, Tensor] = {}
+        if in_training and moving.visible is None:
+            offsets, penalties = self.in_training(moving.means, time)
+        else:
+            offsets = self.offsets(moving.means, time, moving.visible)
+            penalties = self.penalties(time) if in_training else {}
+        return DeformedGaussians(apply_offsets(gaussians, offsets, moving.rows), offsets, penalties)
+
+    def opacity_window(self, gaussians: Gaussians, time: float) -> OpacityWindow | None:
+        """Return the opacities of the moving ``gaussians`` (M) around ``time``, in closed form;
+        None: opacities do not change, or have no closed form."""
+        return None
+
+    def lifetimes(self, gaussians: Gaussians) -> Tensor | None:
+        """Return the first and the last time (M, 2) at which each of the moving ``gaussians`` is
+        drawn; None: any time."""
+        return None
 
     def penalties(self, time: float) -> dict[str, Tensor]:
         """Return weighted regularisation terms of the field by name; some depend on ``time``."""
@@ -179,6 +248,9 @@ class OuterField(DeformationField):
 
     def step(self, step: int, progress: float) -> Count:
         return self.parameters.step(step, progress) + self.inner_field.step(step, progress)
+
+    def opacity_window(self, gaussians: Gaussians, time: float) -> OpacityWindow | None:
+        return self.inner_field.opacity_window(gaussians, time)
 
     def penalties(self, time: float) -> dict[str, Tensor]:
         return self.inner_field.penalties(time)
@@ -271,7 +343,10 @@ def select_rows(x: Tensor, rows: Tensor | None) -> Tensor:
 
 
 class Decoder:
-    """A multilayer perceptron with a zero last layer; layer ``skip`` gets the features again."""
+    """A multilayer perceptron with a zero last layer; layer ``skip`` gets the features again.
+
+    With ``separate_heads`` each head reads only its own part of the last hidden layer.
+    """
 
     def __init__(
         self,
@@ -280,9 +355,12 @@ class Decoder:
         options: FieldSection,
         *,
         skip: int | None = None,
+        separate_heads: bool = False,
     ) -> None:
-        self.widths = [num_inputs, *hidden, sum(head_sizes(options).values())]
+        heads = list(head_sizes(options).values())
+        self.widths = [num_inputs, *hidden, sum(heads)]
         self.skip = skip
+        self.separate_heads = heads if separate_heads else []
 
     def start_values(self, generator: torch.Generator) -> dict[str, Tensor]:
         """Return Glorot weights (Glorot and Bengio 2010), zero biases and a zero last layer."""
@@ -290,6 +368,8 @@ class Decoder:
         last = len(self.widths) - 2
         for i in range(last + 1):
             fan_in = self.widths[i] + (self.widths[0] if i == self.skip else 0)
+            if i == last and self.separate_heads:
+                fan_in //= len(self.separate_heads)
             fan_out = self.widths[i + 1]
             weight = glorot(fan_in, fan_out, generator)
             values[f"weight{i}"] = torch.zeros_like(weight) if i == last else weight
@@ -301,6 +381,10 @@ class Decoder:
             Layer(parameters[f"weight{i}"], parameters[f"bias{i}"])
             for i in range(len(self.widths) - 1)
         ]
+        if self.separate_heads:
+            *others, last = layers
+            weight = torch.block_diag(*last.weight.split(self.separate_heads))
+            layers = [*others, Layer(weight, last.bias)]
         return perceptron(features, layers, skip=self.skip)
 
 

@@ -13,11 +13,27 @@ from dyngs.core.state import Role, State, add_prefix, select_prefix, with_role
 from dyngs.core.tensor_checks import require_positive, require_tensor
 from dyngs.deform.bodies.field import BodyField
 from dyngs.deform.control_nodes import ControlNodes
-from dyngs.deform.field import DeformationField, FieldSetup, Offsets, OuterField, select_rows
+from dyngs.deform.field import (
+    DeformationField,
+    FieldSetup,
+    Offsets,
+    OpacityWindow,
+    OuterField,
+    logit_curvature,
+    select_rows,
+)
 from dyngs.deform.free import FreePrimitives
-from dyngs.deform.keys import ControlNodesField, DeformField, FreeField, HexplaneField, MlpField
+from dyngs.deform.gaussians_4d import Gaussians4D
+from dyngs.deform.keys import (
+    ControlNodesField,
+    DeformField,
+    FreeField,
+    Gaussians4DField,
+    HexplaneField,
+    MlpField,
+)
 from dyngs.deform.networks import Hexplane, Mlp
-from dyngs.gaussians import TopologyEdit
+from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.optimizer import Parameters
 from dyngs.ops.adam import Count
 
@@ -52,6 +68,14 @@ class WindowedField(OuterField):
         logits = window if offsets.logit_opacities is None else offsets.logit_opacities + window
         return replace(offsets, logit_opacities=logits)
 
+    def opacity_window(self, gaussians: Gaussians, time: float) -> OpacityWindow:
+        edges = self.edges.detach().double()
+        window = _window_derivatives(edges, time)
+        open_ = _window_derivatives(edges.new_tensor([OPEN_WINDOW]), time)
+        spans = (edges[:, 1] - edges[:, 0]).clamp_min(EDGE_WIDTH)
+        curvature = logit_curvature(gaussians.logit_opacities, window - open_)
+        return OpacityWindow(curvature, spans.log())
+
     def step(self, step: int, progress: float) -> Count:
         count = super().step(step, progress)
         self.edges.data[:, 0].clamp_min_(OPEN_WINDOW[0])
@@ -82,6 +106,15 @@ def _window(edges: Tensor, time: float) -> Tensor:
     return torch.nn.functional.logsigmoid(inside).sum(1)
 
 
+def _window_derivatives(edges: Tensor, time: float) -> Tensor:
+    """Return (3, M): the windows at ``time``, and their first and second derivative."""
+    outside = torch.stack([edges[:, 0] - time, time - edges[:, 1]], dim=1) / EDGE_WIDTH
+    hidden = outside.sigmoid()
+    slope = (hidden[:, 0] - hidden[:, 1]) / EDGE_WIDTH
+    bend = -(hidden * (1 - hidden)).sum(1) / EDGE_WIDTH**2
+    return torch.stack([_window(edges, time), slope, bend])
+
+
 def create_field(
     options: DeformField, setup: FieldSetup, generator: torch.Generator
 ) -> DeformationField:
@@ -91,15 +124,18 @@ def create_field(
         MlpField: Mlp,
         ControlNodesField: ControlNodes,
         FreeField: FreePrimitives,
+        Gaussians4DField: Gaussians4D,
     }
     return kinds[type(options)](options, setup, generator)
 
 
-def num_values(options: DeformField, num_times: int, num_moving: int = 0) -> int:
+def num_values(
+    options: DeformField, num_times: int, num_moving: int = 0, num_sh_terms: int = 0
+) -> int:
     """Return the number of trained values of a field for ``num_moving`` Gaussians."""
-    setup = FieldSetup(
-        torch.zeros(3, device="cpu"), torch.ones(3, device="cpu"), num_times, num_moving, 1.0
-    )
+    center = torch.zeros(3, device="cpu")
+    half_size = torch.ones(3, device="cpu")
+    setup = FieldSetup(center, half_size, num_times, num_moving, 1.0, num_sh_terms)
     return create_field(options, setup, torch.Generator()).parameters.num_values
 
 

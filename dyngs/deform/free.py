@@ -9,13 +9,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from dyngs.core.state import Role
-from dyngs.deform.field import DeformationField, FieldSetup, Offsets, select_rows
+from dyngs.deform.field import (
+    DeformationField,
+    FieldSetup,
+    Offsets,
+    OpacityWindow,
+    logit_curvature,
+    select_rows,
+)
 from dyngs.deform.fixed_cameras.initial_motion import TimedGaussians
 from dyngs.deform.keys import COPIES_OF_MOVING, FreeField
 from dyngs.gaussians import Gaussians, TopologyEdit
@@ -29,6 +36,7 @@ LR_CENTERS, LR_SPANS, LR_VELOCITIES = 0.01, 0.01, 1e-4
 LR_DECAY = 0.1  # ratio of the last to the first learning rate
 FIRST_SPAN = 0.6  # lifetime of a Gaussian at a single time, in time steps; half opaque after 1.3
 RANDOM_SPAN = 0.25  # lifetime of random Gaussians, in units of the clip
+STATIC_SPAN = 1.0  # lifetime of static Gaussians, in units of the clip
 FAINT_LOGIT = -2.2
 """Initial opacity logit (opacity 0.1) of copies of static Gaussians, if there are timed Gaussians.
 """
@@ -65,6 +73,12 @@ class FreePrimitives(DeformationField):
         spans = log_spans.exp() + MIN_SPAN * self.gap
         window = -0.5 * ((time - centers) / spans).square()
         return Offsets(shift, logit_opacities=window[:, 0])
+
+    def opacity_window(self, gaussians: Gaussians, time: float) -> OpacityWindow:
+        spans = self.parameters["log_spans"].detach()[:, 0].double().exp() + MIN_SPAN * self.gap
+        elapsed = (time - self.parameters["centers"].detach()[:, 0].double()) / spans
+        window = torch.stack([-0.5 * elapsed.square(), -elapsed / spans, -spans.pow(-2)])
+        return OpacityWindow(logit_curvature(gaussians.logit_opacities, window), spans.log())
 
     def apply_edit(self, edit: TopologyEdit) -> FreePrimitives:
         """Return the field after a topology edit; new rows are shifted in time, alternately back
@@ -110,6 +124,22 @@ class FreeInitialization:
     centers: Tensor  # (M,) centre of the window, in units of the clip
     spans: Tensor  # (M,) lifetime, in units of the clip
     velocities: Tensor  # (M, 3) world units per clip
+
+    def with_static(self, moving: Tensor, num_static: int) -> FreeInitialization:
+        """Return the windows of all Gaussians: those of the static model first, at ``moving``
+        (M0,) as before, else as long as the clip."""
+
+        def spread(values: Tensor, fill: float) -> Tensor:
+            before = values.new_full((num_static, *values.shape[1:]), fill)
+            before[moving.to(values.device)] = values[: len(moving)]
+            return torch.cat([before, values[len(moving) :]])
+
+        return replace(
+            self,
+            centers=spread(self.centers, 0.5),
+            spans=spread(self.spans, STATIC_SPAN),
+            velocities=spread(self.velocities, 0.0),
+        )
 
 
 def initialize_free(

@@ -43,9 +43,12 @@ class DynamicKind(HasSizeLimit, HasMotion, HasSchedules):
         return section.model_copy(update={"num_random_moving": count})
 
     def num_shared(self, section: DynamicModel, num_times: int, num_moving: int = 0) -> int:
+        from dyngs.core.conventions import num_sh_terms
         from dyngs.deform.fields import num_values
 
-        return num_values(section.deform, num_times, num_moving) if num_times > 1 else 0
+        if num_times <= 1:
+            return 0
+        return num_values(section.deform, num_times, num_moving, num_sh_terms(section.sh_degree))
 
 
 DYNAMIC = DynamicKind(DynamicModel)

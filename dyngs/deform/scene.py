@@ -10,8 +10,9 @@ from torch import Tensor
 
 from dyngs.core.state import Role, State, StateTensor, add_prefix, select_prefix
 from dyngs.core.tensor_checks import require_ascending, require_indices
-from dyngs.deform.field import DeformationField, Offsets, apply_offsets
+from dyngs.deform.field import DeformationField, DeformedGaussians, MovingRows
 from dyngs.deform.fields import field_state, restore_field
+from dyngs.deform.gaussians_4d import Gaussians4D
 from dyngs.deform.keys import DynamicModel
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.filters import apply_filter, filter_state, restore_filter
@@ -83,27 +84,37 @@ class DynamicScene(GaussianScene):
         if self.field is None or self.is_static:
             return GaussianTimeStep(apply_filter(self.gaussians, self.filter_std), now)
         part = self._visible_around(now)
-        offsets = self.field.offsets(part.moving_means, now, part.visible_rows)
-        return GaussianTimeStep(part.apply(offsets, self.field, now), now)
+        return GaussianTimeStep(part.deform(self.field, now).gaussians, now)
 
-    def in_training(
-        self, time: float, *, detach: bool
-    ) -> tuple[Gaussians, Offsets, dict[str, Tensor]]:
-        """Return the Gaussians at ``time``, the offsets of the moving ones, and the field's
-        penalties.
+    def drawing_step(self, time: float | None) -> GaussianTimeStep:
+        """Return ``time_step``; without gradients only the Gaussians that are drawn at ``time``."""
+        if self.field is None or self.is_static or torch.is_grad_enabled():
+            return self.time_step(time)
+        if "lifetimes" not in self._derived:
+            moving = self.gaussians.picked(self.moving)
+            self._derived["lifetimes"] = self.field.lifetimes(moving)
+        lifetimes = self._derived["lifetimes"]
+        if lifetimes is None:
+            return self.time_step(time)
+        now = clamp_time(time)
+        is_drawn = torch.ones(len(self), dtype=torch.bool, device=self.device)
+        is_drawn[self.moving] = (lifetimes[:, 0] <= now) & (now <= lifetimes[:, 1])
+        if self.masks is not None:
+            is_drawn &= self.masks.visible(self.masks.interval(now))
+        part = self._select(self.gaussians, torch.nonzero(is_drawn)[:, 0])
+        return GaussianTimeStep(part.deform(self.field, now).gaussians, now)
+
+    def in_training(self, time: float, *, detach: bool) -> DeformedGaussians:
+        """Return the Gaussians at ``time`` with offsets and penalties.
 
         With ``detach`` only the field gets gradients, not the canonical Gaussians.
         """
         if self.field is None:
             raise ValueError("the scene has no deformation field")
-        interval = 0 if self.masks is None else self.masks.interval(time)
-        part = self._select_visible(self.gaussians.detach() if detach else self.gaussians, interval)
-        if part.visible_rows is None:
-            offsets, penalties = self.field.in_training(part.moving_means, time)
-        else:
-            offsets = self.field.offsets(part.moving_means, time, part.visible_rows)
-            penalties = self.field.penalties(time)
-        return part.apply(offsets, self.field, time), offsets, penalties
+        part = self._select(
+            self.gaussians.detach() if detach else self.gaussians, self._active(time)
+        )
+        return part.deform(self.field, time, in_training=True)
 
     def apply_edit(self, edit: TopologyEdit) -> DynamicScene:
         position = torch.full((len(self),), -1, device=self.moving.device)
@@ -122,6 +133,17 @@ class DynamicScene(GaussianScene):
             filter_std=None if self.filter_std is None else edit.apply(self.filter_std),
         )
 
+    def drawing_state(self) -> State:
+        """Return the tensors needed for rendering, with equivalent rotations of 4D Gaussians."""
+        state = super().drawing_state()
+        if isinstance(self.field, Gaussians4D) and len(self.moving):
+            quats = self.gaussians.quats.detach()
+            left, right = self.field.storage_quats(quats[self.moving])
+            left = quats.index_copy(0, self.moving, left)
+            state["gaussians.quats"] = StateTensor(left, Role.PER_GAUSSIAN)
+            state["model.field.learned.right_quats"] = StateTensor(right, Role.PER_MOVING)
+        return state
+
     def _model_state(self) -> State:
         state = filter_state(self.filter_std) | times_state(self.training_times)
         if self.field is not None:
@@ -129,25 +151,30 @@ class DynamicScene(GaussianScene):
             state["rows"] = StateTensor(self.moving, Role.SHARED)
         return state if self.masks is None else state | add_prefix("masks", self.masks.state())
 
+    def _active(self, time: float) -> Tensor | None:
+        """Return ascending indices (A,) of the Gaussians that the masks show at ``time``; None:
+        all."""
+        return None if self.masks is None else self.masks.active(self.masks.interval(time))
+
     def _visible_around(self, time: float) -> _VisiblePart:
         """Return the visible part around ``time``; without gradients the last one is cached."""
-        interval = 0 if self.masks is None else self.masks.interval(time)
         if torch.is_grad_enabled():
-            return self._select_visible(self.gaussians, interval)
-        if interval not in self._derived:
-            self._derived.clear()
-            self._derived[interval] = self._select_visible(self.gaussians, interval)
-        return self._derived[interval]
+            return self._select(self.gaussians, self._active(time))
+        interval = 0 if self.masks is None else self.masks.interval(time)
+        if self._derived.get("interval") != interval:
+            self._derived["interval"] = interval
+            self._derived["part"] = self._select(self.gaussians, self._active(time))
+        return self._derived["part"]
 
-    def _select_visible(self, gaussians: Gaussians, interval: int) -> _VisiblePart:
+    def _select(self, gaussians: Gaussians, active: Tensor | None) -> _VisiblePart:
         means = gaussians.means.index_select(0, self.moving)
-        if self.masks is None:
+        if active is None:
             rows = None if len(self.moving) == len(self) else self.moving
-            return _VisiblePart(gaussians, self.filter_std, means, None, rows)
-        active = self.masks.active(interval)
+            return _VisiblePart(gaussians, self.filter_std, MovingRows(means, None, rows))
         std = None if self.filter_std is None else self.filter_std[active]
         visible_rows, rows = intersect_sorted(self.moving, active, len(self))
-        return _VisiblePart(gaussians.picked(active), std, means, visible_rows, rows)
+        moving = MovingRows(means, visible_rows, rows)
+        return _VisiblePart(gaussians.picked(active), std, moving)
 
 
 def field_scene_of(scene: Renderable) -> DynamicScene | None:
@@ -161,10 +188,12 @@ class _VisiblePart:
 
     gaussians: Gaussians  # A canonical Gaussians
     filter_std: Tensor | None  # (A,) or None
-    moving_means: Tensor  # (M, 3) canonical means of all moving Gaussians
-    visible_rows: Tensor | None  # indices of the visible ones among the M; None: all
-    rows: Tensor | None  # their rows among the A; None: all, in order
+    moving: MovingRows
 
-    def apply(self, offsets: Offsets, field: DeformationField, time: float) -> Gaussians:
-        now = apply_filter(apply_offsets(self.gaussians, offsets, self.rows), self.filter_std)
-        return field.apply_shading(now, self.rows, self.visible_rows, time)
+    def deform(
+        self, field: DeformationField, time: float, *, in_training: bool = False
+    ) -> DeformedGaussians:
+        now = field.deform(self.gaussians, self.moving, time, in_training=in_training)
+        filtered = apply_filter(now.gaussians, self.filter_std)
+        shaded = field.apply_shading(filtered, self.moving.rows, self.moving.visible, time)
+        return replace(now, gaussians=shaded)

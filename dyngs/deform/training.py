@@ -24,7 +24,8 @@ from dyngs.deform.fields import WindowedField, create_field
 from dyngs.deform.fixed_cameras.hulls import FixedCameraClip
 from dyngs.deform.fixed_cameras.initial_motion import InitialMotion, find_initial_motion
 from dyngs.deform.free import FreeInitialization, FreePrimitives, initialize_free
-from dyngs.deform.keys import DynamicModel, FreeField
+from dyngs.deform.gaussians_4d import Gaussians4D
+from dyngs.deform.keys import TIMED_FIELDS, DynamicModel, MlpField
 from dyngs.deform.random_gaussians import box_of, random_gaussians, with_gaussians
 from dyngs.deform.scene import DynamicScene
 from dyngs.deform.schedule import DeformSchedule, TimeWindow
@@ -129,7 +130,8 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         generator: torch.Generator,
     ) -> None:
         self.options, self.schedule, self.capture = options, schedule, capture
-        self._is_free = isinstance(options.deform, FreeField)
+        self._has_lifetimes = isinstance(options.deform, TIMED_FIELDS)
+        self.means_decay_from = 0 if options.static_decay else schedule.coarse_end
         self.times = tuple(sorted(set(capture.times)))
         self._set_time_window(False)
         self._update, self._generator = update, generator
@@ -154,11 +156,10 @@ class DynamicTraining(SceneTraining[DynamicScene]):
     def time_step(self, scene: DynamicScene, image: Image, step: int) -> GaussianTimeStep:
         if scene.field is None:
             return scene.time_step(image.time)
-        time = image.time or 0.0
-        gaussians, offsets, penalties = scene.in_training(
-            time, detach=self._window.is_frontier_step(step)
-        )
-        return GaussianTimeStep(gaussians, image.time, None, penalties | self._sparsity(offsets))
+        time = (image.time or 0.0) + self._time_noise(step)
+        now = scene.in_training(time, detach=self._window.is_frontier_step(step))
+        penalties = now.penalties | self._sparsity(now.offsets)
+        return GaussianTimeStep(now.gaussians, image.time, None, penalties)
 
     def optimize(self, scene: DynamicScene, step: int) -> Count:
         if scene.field is None:
@@ -169,6 +170,43 @@ class DynamicTraining(SceneTraining[DynamicScene]):
 
     def skip_unseen_rows(self, scene: DynamicScene) -> Tensor | None:
         return scene.moving if scene.field is not None and scene.field.has_lifetime else None
+
+    def time_gradient(self, scene: DynamicScene) -> Tensor | None:
+        if not isinstance(scene.field, Gaussians4D):
+            return None
+        gradient = scene.gaussians.means.detach().new_zeros(len(scene))
+        threshold = scene.field.options.time_grad_threshold
+        gradient[scene.moving] = scene.field.time_gradient / threshold
+        return gradient
+
+    def split_in_time(
+        self, scene: DynamicScene, result: EditResult, generator: torch.Generator
+    ) -> EditResult:
+        is_split = isinstance(scene.field, Gaussians4D) and "means" in result.changes
+        if not is_split or result.edit is None or scene.is_static:
+            return result
+        position = torch.full((len(scene),), -1, device=scene.device)
+        position[scene.moving] = torch.arange(len(scene.moving), device=scene.device)
+        old = scene.gaussians.log_scales.detach()[result.edit.source]
+        shrunk = (result.changes["log_scales"] != old).any(1)
+        origin = position[result.edit.source]
+        children = torch.nonzero(shrunk & (origin >= 0))[:, 0]
+        source = result.edit.source[children]
+        gaussians = scene.gaussians.detach().select(source)
+        means, changes = scene.field.split(gaussians, origin[children], generator)
+        moved = result.changes["means"].clone()
+        moved[children] = means
+        fill = {}
+        for name, values in changes.items():
+            fill[name] = scene.field.parameters[name].detach()[origin.clamp_min(0)]
+            fill[name][children] = values
+        return replace(result, changes=result.changes | {"means": moved}, motion_changes=fill)
+
+    def with_motion(self, scene: DynamicScene, changes: Mapping[str, Tensor]) -> DynamicScene:
+        if scene.field is not None:
+            for name, values in changes.items():
+                scene.field.parameters[name].data.copy_(values[scene.moving])
+        return scene
 
     def leaves(self, scene: DynamicScene) -> list[Tensor]:
         return [] if scene.field is None else scene.field.leaves
@@ -182,7 +220,8 @@ class DynamicTraining(SceneTraining[DynamicScene]):
             scene.field.invalidate()
         scene.field.extend(self._window.bounds(step), self._window.bounds(step + 1))
         scene = self._add_windows(scene, step)
-        return self._freeze_static(scene) if step in self.schedule.freeze_steps else scene
+        freezes = step in self.schedule.freeze_steps and scene.field.can_freeze
+        return self._freeze_static(scene) if freezes else scene
 
     def edit_scene(self, scene: DynamicScene, step: int) -> tuple[DynamicScene, EditResult] | None:
         """Add the Gaussians that motion starts with; None if a static model explains all images."""
@@ -197,7 +236,7 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         threshold = min(max(otsu_threshold(errors.typical), floor), SURELY_MOVING * floor)
         rows = torch.nonzero(errors.typical > threshold)[:, 0]
         first = self._find_initial_motion(now.detach())
-        if not has_errors and not first.timed_gaussians:
+        if self.options.select_moving and not has_errors and not first.timed_gaussians:
             return None
         bodies = self._find_bodies(now.detach())
         added, start = self._build_added(now.detach(), rows, first, bodies)
@@ -207,11 +246,25 @@ class DynamicTraining(SceneTraining[DynamicScene]):
             result.changes["logit_opacities"][rows] = start.logits.to(rows.device)
         gaussians = Gaussians(**result.changes)
         moving = torch.cat([rows, torch.arange(len(now), len(gaussians), device=rows.device)])
+        if not self.options.select_moving:
+            start = None if start is None else start.with_static(rows, len(now))
+            moving = torch.arange(len(gaussians), device=rows.device)
         center, half_size = box_of(now, self.capture.extent)
-        setup = FieldSetup(center, half_size, len(self.times), len(moving), self.capture.extent)
+        setup = FieldSetup(
+            center,
+            half_size,
+            len(self.times),
+            len(moving),
+            self.capture.extent,
+            now.sh.shape[1] if scene.colour is None else 0,
+        )
         field = create_field(self.options.deform, setup, self._generator)
         if isinstance(field, FreePrimitives) and start is not None:
             field = field.with_initialization(start)
+        if isinstance(field, Gaussians4D) and start is not None:
+            field, tilted = field.with_initialization(start, gaussians.select(moving))
+            for name in ("quats", "log_scales"):
+                result.changes[name][moving] = getattr(tilted, name).to(moving.device)
         if bodies is not None:
             field = bodies.build_field(field)
             self._set_time_window(bodies.explains_all_motion)
@@ -234,7 +287,7 @@ class DynamicTraining(SceneTraining[DynamicScene]):
 
     def _set_time_window(self, all_times: bool) -> None:
         """Set the time window: all times at once if ``all_times``, else growing from the middle."""
-        first = 1.0 if all_times or self._is_free else self.options.time_window
+        first = 1.0 if all_times or self._has_lifetimes else self.options.time_window
         phases = (
             self.schedule.coarse_end,
             self.schedule.window_grows_from,
@@ -245,7 +298,9 @@ class DynamicTraining(SceneTraining[DynamicScene]):
 
     def _find_bodies(self, static: Gaussians) -> Bodies | None:
         """Find rigid bodies in the images of one moving camera."""
-        frame_stack = None if self._is_free else self.capture.frame_stack(static)
+        if self._has_lifetimes or not self.options.select_moving:
+            return None
+        frame_stack = self.capture.frame_stack(static)
         if frame_stack is None:
             return None
         return find_bodies(frame_stack, self.options.num_random_moving, static.sh.shape[1])
@@ -261,15 +316,15 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         is_explained = first.timed_gaussians or (bodies and bodies.explains_all_motion)
         count = 0 if is_explained else self.options.num_random_moving
         added = random_gaussians(now, count, self.capture.extent, self._generator)
-        if not self._is_free:
+        if not self._has_lifetimes:
             return [added, *(bodies.seeds if bodies else ())], None
         static, others = (x.to(device="cpu") for x in (now.select(rows), added))
         start = initialize_free(static, first.timed_gaussians, others, len(self.times))
         return start.added, start
 
     def _find_initial_motion(self, static: Gaussians) -> InitialMotion:
-        """Find motion in front of fixed cameras, for free primitives."""
-        if not self._is_free:
+        """Find motion in front of fixed cameras, for Gaussians with a lifetime."""
+        if not self._has_lifetimes:
             return InitialMotion()
         capture = self.capture
         limit = self.options.num_random_moving
@@ -307,9 +362,20 @@ class DynamicTraining(SceneTraining[DynamicScene]):
             moves &= errors.typical[scene.moving] > SURELY_STATIC * self.options.motion_threshold
         return _freeze(scene, mean, ~moves)
 
-    def _sparsity(self, offsets: Offsets) -> dict[str, Tensor]:
-        """Return the mean displacement as a regularisation term; free primitives have none."""
-        if self.options.motion_sparsity == 0 or self._is_free or not len(offsets.means):
+    def _time_noise(self, step: int) -> float:
+        """Return a random offset of the time of a training view (Deformable-3DGS)."""
+        field = self.options.deform
+        remaining = 1 - 2 * step / self.schedule.rates.steps
+        if not isinstance(field, MlpField) or field.time_noise == 0 or remaining <= 0:
+            return 0.0
+        sample = torch.randn((), generator=self._generator, device="cpu")
+        return field.time_noise * remaining / len(self.times) * float(sample)
+
+    def _sparsity(self, offsets: Offsets | None) -> dict[str, Tensor]:
+        """Return the mean displacement as a regularisation term; Gaussians with a lifetime have
+        none."""
+        is_off = self.options.motion_sparsity == 0 or self._has_lifetimes
+        if is_off or offsets is None or not len(offsets.means):
             return {}
         tiny = 1e-6 * self.capture.extent
         length = (offsets.means.square().sum(1) + tiny**2).sqrt().mean()

@@ -55,6 +55,10 @@ class Densifier:
         """Accumulate the probe's gradient (V, N, 4) and radii (V, N, 2) of images of ``size``
         (width, height)."""
 
+    def add_time_gradient(self, step: int, gradient: Tensor | None) -> None:
+        """Accumulate the loss gradient (N,) of a step by the mean times, in units of its
+        threshold."""
+
     def tallies(self, step: int, count: int) -> list[Tensor]:
         """Return the sums of ``step`` over N = ``count`` Gaussians; processes all-reduce them in
         place."""
@@ -108,6 +112,8 @@ class DefaultDensifier(Densifier):
         # step.
         self.sums = torch.zeros(2, 0, device="cpu")
         self._step_sums = self.sums
+        # (2, N) sums of time gradient magnitudes and numbers of steps, since the last edit
+        self.time_sums = self.sums
 
     def needs_gradient(self, step: int) -> bool:
         return step < self.schedule.stop
@@ -126,6 +132,15 @@ class DefaultDensifier(Densifier):
         counts = (radii > 0).all(-1) & length.isfinite()
         self._step_sums += torch.stack([torch.where(counts, length, 0.0).sum(0), counts.sum(0)])
 
+    def add_time_gradient(self, step: int, gradient: Tensor | None) -> None:
+        if gradient is None or not self.needs_gradient(step):
+            return
+        magnitude = gradient.abs()
+        counts = (magnitude > 0) & magnitude.isfinite()
+        added = torch.stack([torch.where(counts, magnitude, 0.0), counts.to(magnitude.dtype)])
+        same = self.time_sums.shape == added.shape
+        self.time_sums = self.time_sums + added if same else added
+
     def tallies(self, step: int, count: int) -> list[Tensor]:
         if not self.needs_gradient(step):
             return []
@@ -141,6 +156,7 @@ class DefaultDensifier(Densifier):
         if self.schedule.densifies_at(step) and self.sums.shape[1] == len(parameters):
             result = self._densify(step, parameters, generator)
             self.sums = torch.zeros(2, 0, device="cpu")
+            self.time_sums = self.sums
         elif resets:
             result = EditResult(None)
         else:
@@ -149,6 +165,7 @@ class DefaultDensifier(Densifier):
 
     def move_to(self, device: torch.device) -> None:
         self.sums = self.sums.to(device)
+        self.time_sums = self.time_sums.to(device)
         self.center = self.center.to(device)
 
     def limit(self, max_gaussians: int) -> None:
@@ -156,13 +173,14 @@ class DefaultDensifier(Densifier):
 
     def state(self) -> dict[str, Tensor]:
         self._accumulate_step()
-        return {"grad_sum": self.sums[0], "seen": self.sums[1]}
+        state = {"grad_sum": self.sums[0], "seen": self.sums[1]}
+        if self.time_sums.shape[1]:
+            state |= {"time_grad_sum": self.time_sums[0], "time_seen": self.time_sums[1]}
+        return state
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        count = len(state.get("seen", ()))  # 0 if the run was edited after its end
-        names = ("grad_sum", "seen") if count else ()
-        sums = [require_tensor(name, state[name], (count,)) for name in names]
-        self.sums = torch.stack(sums) if sums else self.sums[:, :0]
+        self.sums = _stored_sums(state, "grad_sum", "seen")
+        self.time_sums = _stored_sums(state, "time_grad_sum", "time_seen")
         self._step_sums = self.sums[:, :0]
 
     def _reset_step(self, count: int, device: torch.device) -> None:
@@ -184,8 +202,20 @@ class DefaultDensifier(Densifier):
             PRUNE_SCALE * reference_length if step > self.schedule.prune_scale_after else math.inf
         )
         score = self.sums[0] / self.sums[1].clamp_min(1)
+        if self.time_sums.shape == self.sums.shape:
+            time_score = self.time_sums[0] / self.time_sums[1].clamp_min(1)
+            score = torch.maximum(score, self.options.grad_threshold * time_score)
         plan = plan_edit(parameters, score, self.options, reference_length, max_scale)
         return apply_plan(parameters, plan, generator)
+
+
+def _stored_sums(state: dict[str, Tensor], *names: str) -> Tensor:
+    """Return the sums with these ``names`` (2, N) in a state; empty if the run was edited after
+    its end."""
+    count = len(state.get(names[1], ()))
+    if not count:
+        return torch.zeros(2, 0, device="cpu")
+    return torch.stack([require_tensor(name, state[name], (count,)) for name in names])
 
 
 class EditPlan(NamedTuple):
@@ -215,6 +245,9 @@ def plan_edit(
     """
     scale = parameters.log_scales.amax(1).exp()
     opaque = parameters.opacities >= options.prune_opacity
+    if len(scale) <= options.prune_above:
+        opaque = torch.ones_like(opaque)
+        max_scale = math.inf
     survives = opaque & (scale <= max_scale)
     wanted = opaque & (score >= options.grad_threshold)
     large = scale > DENSE_FRACTION * reference_length

@@ -46,8 +46,10 @@ class SceneTraining(Generic[S]):
         moves_by: name of the part that moves Gaussians, and the config section of its learning
             rates.
         colour_loss: image loss; None: L1 and D-SSIM.
+        means_decay_from: step from which the learning rate of positions decays.
     """
 
+    means_decay_from = 0
     deformation_name: tuple[str, str] = ("", "")
     colour_loss: Loss | None = None
 
@@ -84,6 +86,19 @@ class SceneTraining(Generic[S]):
     def after_step(self, scene: S, step: int, edited: bool) -> S:
         """Return the scene for the next step: 3D filter updated, motion extrapolated, Gaussians
         frozen."""
+        return scene
+
+    def time_gradient(self, scene: S) -> Tensor | None:
+        """Return the loss gradient (N,) by the mean times of the Gaussians, in units of the
+        threshold of densification; None without times."""
+        return None
+
+    def split_in_time(self, scene: S, result: EditResult, generator: torch.Generator) -> EditResult:
+        """Return the edit with the halves of split Gaussians also spread over time."""
+        return result
+
+    def with_motion(self, scene: S, changes: Mapping[str, Tensor]) -> S:
+        """Return the scene after an edit with new values of the motion, see ``EditResult``."""
         return scene
 
     def edit_scene(self, scene: S, step: int) -> tuple[S, EditResult] | None:
@@ -226,10 +241,12 @@ class GaussianModel(Model[GaussianScene]):
     def update(self, step: int) -> UpdateResult:
         before = self._optimizer.parameters
         generator = self._generator
-        lr_means = means_rate(self._rates, self._rate_schedule.progress(step), self._run.extent)
+        progress = self._rate_schedule.progress(step, since=self.training.means_decay_from)
+        lr_means = means_rate(self._rates, progress, self._run.extent)
         frozen = self.colours.frozen_harmonics()
         skip_unseen_rows = self.training.skip_unseen_rows(self._scene)
         frozen_mask = self.training.frozen_mask()
+        self.densifier.add_time_gradient(step, self.training.time_gradient(self._scene))
         bad = self._optimizer.step(
             step,
             lr_means,
@@ -242,6 +259,7 @@ class GaussianModel(Model[GaussianScene]):
         if result is not None:
             if frozen_mask is not None:
                 result = frozen_mask.exclude_from_edit(result, self._optimizer.parameters)
+            result = self.training.split_in_time(self._scene, result, generator)
             self._apply(self._sort_by_morton_code(result))
         self._perturb(lr_means)
         self._scene = self.training.after_step(self._scene, step, result is not None)
@@ -350,6 +368,8 @@ class GaussianModel(Model[GaussianScene]):
         self._optimizer.apply(result)
         if edited is None:
             edited = self._scene if result.edit is None else self._scene.apply_edit(result.edit)
+        if result.motion_changes:
+            edited = self.training.with_motion(edited, result.motion_changes)
         self._scene = edited.with_gaussians(self._optimizer.parameters)
         if result.edit is not None:
             self.colours.apply_edit(result.edit)
@@ -364,7 +384,8 @@ class GaussianModel(Model[GaussianScene]):
         means = result.changes.get("means", edit.apply(self._optimizer.parameters.means.detach()))
         order = torch.from_numpy(morton_order(means.cpu().numpy())).to(means.device)
         changes = {name: x[order] for name, x in result.changes.items()}
-        return replace(result, edit=edit.in_order(order), changes=changes)
+        motion = {name: x[order] for name, x in result.motion_changes.items()}
+        return replace(result, edit=edit.in_order(order), changes=changes, motion_changes=motion)
 
     def _measure_harmonics(self, step: int) -> str | None:
         """Drop SH that do not improve held-out views if due at this step; return a message."""
