@@ -10,12 +10,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from dyngs.core.conventions import MAX_SH_DEGREE, num_sh_terms
 from dyngs.core.state import Role
+from dyngs.deform import predictor
 from dyngs.deform.field import (
     DeformationField,
     DeformedGaussians,
@@ -28,6 +30,7 @@ from dyngs.deform.keys import Gaussians4DField
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.densify import SPLIT_SHRINK
 from dyngs.gaussians.optimizer import Parameters
+from dyngs.ops.adam import Count
 from dyngs.ops.quaternions import identity_quat, quat_product, unit_quats
 from dyngs.ops.slicing import slice_gaussians
 
@@ -35,6 +38,17 @@ LR_QUATS = 1e-3  # learning rate of the right quaternions, that of 3DGS for rota
 LR_SH = 0.0025 / 20  # learning rate of SH coefficients over time, that of 3DGS above degree 0
 LR_DECAY = 0.1  # ratio of the last to the first learning rate
 MIN_SPAN = 0.25  # smallest standard deviation along time, in time steps
+
+
+class _Shape(NamedTuple):
+    """What the predictor multiplies, of A Gaussians, in the order of its outputs."""
+
+    means: Tensor  # (A, 3)
+    times: Tensor  # (A, 1)
+    log_scales: Tensor  # (A, 3)
+    log_spans: Tensor  # (A, 1)
+    quats: Tensor  # (A, 4)
+    right_quats: Tensor  # (A, 4)
 
 
 class Gaussians4D(DeformationField):
@@ -55,30 +69,51 @@ class Gaussians4D(DeformationField):
         count = setup.num_moving
         quats = identity_quat(torch.zeros(1, device="cpu")).expand(count, 4)
         centers = torch.full((count,), 0.5, device="cpu")
-        self.parameters = self._untrained(centers, torch.ones(count, device="cpu"), quats)
+        width = options.predictor_width
+        self.depends_on_view = width > 0
+        network = predictor.start_values(width, generator) if width else {}
+        self._network_names = tuple(network)
+        self.parameters = self._untrained(centers, torch.ones(count, device="cpu"), quats, network)
 
     def with_initialization(self, start: FreeInitialization, quats: Tensor) -> Gaussians4D:
         """Return an untrained field with the times and spans of ``start``, without velocities.
 
         ``quats`` (M, 4): rotations of the canonical Gaussians.
         """
-        return self.with_parameters(self._untrained(start.centers, start.spans, quats.to("cpu")))
+        network = {name: self.parameters[name] for name in self._network_names}
+        started = self._untrained(start.centers, start.spans, quats.to("cpu"), network)
+        return self.with_parameters(started)
+
+    def step(self, step: int, progress: float) -> Count:
+        for name in self._network_names:
+            weights = self.parameters[name]
+            if weights.grad is not None:
+                weights.grad.add_(weights.detach(), alpha=predictor.WEIGHT_DECAY)
+        return super().step(step, progress)
 
     def deform(
-        self, gaussians: Gaussians, moving: MovingRows, time: float, *, in_training: bool = False
+        self,
+        gaussians: Gaussians,
+        moving: MovingRows,
+        time: float,
+        *,
+        in_training: bool = False,
+        eye: Tensor | None = None,
     ) -> DeformedGaussians:
         own = gaussians if moving.rows is None else gaussians.picked(moving.rows)
         times, log_spans, right_quats = (
             select_rows(self.parameters[name], moving.visible)
             for name in ("times", "log_spans", "right_quats")
         )
+        shape = _Shape(own.means, times, own.log_scales, log_spans, own.quats, right_quats)
+        shape = self._deformed(shape, time, eye) if self.depends_on_view else shape
         sliced = slice_gaussians(
-            own.means,
-            times[:, 0],
-            own.quats,
-            right_quats,
-            own.log_scales,
-            log_spans[:, 0],
+            shape.means,
+            shape.times[:, 0],
+            shape.quats,
+            shape.right_quats,
+            shape.log_scales,
+            shape.log_spans[:, 0],
             own.logit_opacities,
             time,
         )
@@ -89,6 +124,33 @@ class Gaussians4D(DeformationField):
         for name, values in now.tensors().items():
             tensors[name] = tensors[name].index_copy(0, moving.rows, values)
         return DeformedGaussians(Gaussians(**tensors))
+
+    def _deformed(self, shape: _Shape, time: float, eye: Tensor | None) -> _Shape:
+        """Return the Gaussians as the predictor deforms them at ``time``, seen from ``eye`` (3,).
+
+        Means are multiplied about the centre of the motion and the middle of the clip. A scale is
+        multiplied by exp(c) instead of 1 + c and so stays positive.
+        """
+        means = shape.means.detach()
+        directions = None
+        if eye is not None:
+            directions = torch.nn.functional.normalize(means - eye.detach().to(means), dim=1)
+        changes = predictor.predict_changes(
+            self.parameters,
+            self.setup.normalize(means),
+            shape.times.detach(),
+            directions,
+            time,
+        )
+        parts = _Shape(*changes.split([x.shape[1] for x in shape], dim=1))
+        return _Shape(
+            shape.means + (shape.means - self.setup.center) * parts.means,
+            shape.times + (shape.times - 0.5) * parts.times,
+            shape.log_scales + parts.log_scales,
+            shape.log_spans + parts.log_spans,
+            shape.quats + shape.quats * parts.quats,
+            shape.right_quats + shape.right_quats * parts.right_quats,
+        )
 
     def _colours(self, sh: Tensor, elapsed: Tensor, visible: Tensor | None) -> Tensor:
         """Return SH coefficients (A, K, 3), ``elapsed`` (A, 1) clips after the mean times."""
@@ -138,7 +200,9 @@ class Gaussians4D(DeformationField):
         field = Gaussians4D(self.options, setup, torch.Generator())
         return super(Gaussians4D, field).with_state(tensors)
 
-    def _untrained(self, centers: Tensor, spans: Tensor, quats: Tensor) -> Parameters:
+    def _untrained(
+        self, centers: Tensor, spans: Tensor, quats: Tensor, network: Mapping[str, Tensor]
+    ) -> Parameters:
         tensors = {
             "times": centers[:, None],
             "log_spans": spans.clamp_min(MIN_SPAN * self.gap).log()[:, None],
@@ -153,4 +217,7 @@ class Gaussians4D(DeformationField):
             "right_quats": LR_QUATS,
             "sh_time": LR_SH,
         }
-        return Parameters(tensors, rates, LR_DECAY, Role.PER_MOVING)
+        roles = dict.fromkeys(tensors, Role.PER_MOVING) | dict.fromkeys(network, Role.SHARED)
+        decays = dict.fromkeys(tensors, LR_DECAY) | dict.fromkeys(network, predictor.LR_DECAY)
+        rates |= dict.fromkeys(network, predictor.LR)
+        return Parameters(tensors | dict(network), rates, decays, roles)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -83,10 +84,14 @@ class DynamicScene(GaussianScene):
         if self.field is None or self.is_static:
             return GaussianTimeStep(apply_filter(self.gaussians, self.filter_std), now)
         part = self._visible_around(now)
-        return GaussianTimeStep(part.deform(self.field, now).gaussians, now)
+        deform = partial(part.deform, self.field, now)
+        from_eye = (lambda eye: deform(eye=eye).gaussians) if self.field.depends_on_view else None
+        return GaussianTimeStep(deform().gaussians, now, from_eye=from_eye)
 
-    def in_training(self, time: float, *, detach: bool) -> DeformedGaussians:
-        """Return the Gaussians at ``time`` with offsets and penalties.
+    def in_training(
+        self, time: float, *, detach: bool, eye: Tensor | None = None
+    ) -> DeformedGaussians:
+        """Return the Gaussians at ``time``, seen from ``eye`` (3,), with offsets and penalties.
 
         With ``detach`` only the field gets gradients, not the canonical Gaussians.
         """
@@ -94,7 +99,7 @@ class DynamicScene(GaussianScene):
             raise ValueError("the scene has no deformation field")
         interval = 0 if self.masks is None else self.masks.interval(time)
         part = self._select_visible(self.gaussians.detach() if detach else self.gaussians, interval)
-        return part.deform(self.field, time, in_training=True)
+        return part.deform(self.field, time, in_training=True, eye=eye)
 
     def apply_edit(self, edit: TopologyEdit) -> DynamicScene:
         position = torch.full((len(self),), -1, device=self.moving.device)
@@ -156,9 +161,14 @@ class _VisiblePart:
     moving: MovingRows
 
     def deform(
-        self, field: DeformationField, time: float, *, in_training: bool = False
+        self,
+        field: DeformationField,
+        time: float,
+        *,
+        in_training: bool = False,
+        eye: Tensor | None = None,
     ) -> DeformedGaussians:
-        now = field.deform(self.gaussians, self.moving, time, in_training=in_training)
+        now = field.deform(self.gaussians, self.moving, time, in_training=in_training, eye=eye)
         filtered = apply_filter(now.gaussians, self.filter_std)
         shaded = field.apply_shading(filtered, self.moving.rows, self.moving.visible, time)
         return replace(now, gaussians=shaded)
