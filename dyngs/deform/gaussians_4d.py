@@ -140,7 +140,7 @@ class Gaussians4D(DeformationField):
             self.setup.normalize(means),
             shape.times.detach(),
             directions,
-            time,
+            means.new_full((1, 1), time),
         )
         parts = _Shape(*changes.split([x.shape[1] for x in shape], dim=1))
         return _Shape(

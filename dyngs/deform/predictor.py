@@ -48,9 +48,9 @@ def start_values(width: int, generator: torch.Generator) -> dict[str, Tensor]:
 
 
 def predict_changes(
-    parameters: Parameters, means: Tensor, times: Tensor, directions: Tensor | None, time: float
+    parameters: Parameters, means: Tensor, times: Tensor, directions: Tensor | None, now: Tensor
 ) -> Tensor:
-    """Return the factors minus 1 (M, 16) of M Gaussians at ``time``.
+    """Return the factors minus 1 (M, 16) of M Gaussians at the time ``now``.
 
     Their order: mean (3), its time, scales (3), scale along time, left and right rotation (4 each).
 
@@ -59,6 +59,7 @@ def predict_changes(
         times: (M, 1) mean times in clips.
         directions: (M, 3) unit vectors from the camera; None: a view from nowhere, whose encoding
             is zero.
+        now: (1, 1), or (M, 1) with a time for each Gaussian.
     """
 
     def branch(name: str, inputs: Tensor) -> Tensor:
@@ -73,7 +74,7 @@ def predict_changes(
     features = [
         branch("means", encoded(torch.cat([means, 2 * times - 1], dim=1))),
         branch("directions", views).expand(count, -1),
-        branch("times", encoded(means.new_full((1, 1), 2 * time - 1))).expand(count, -1),
+        branch("times", encoded(2 * now - 1)).expand(count, -1),
     ]
     return perceptron(torch.cat(features, dim=1), _layers(parameters, "joined", 3))
 
