@@ -71,21 +71,26 @@ class Gaussians4D(DeformationField):
         centers = torch.full((count,), 0.5, device="cpu")
         width = options.predictor_width
         self.depends_on_view = width > 0
-        network = predictor.start_values(width, generator) if width else {}
-        self._network_names = tuple(network)
-        self.parameters = self._untrained(centers, torch.ones(count, device="cpu"), quats, network)
+        self._network = predictor.start_values(width, generator) if width else {}
+        spans = torch.ones(count, device="cpu")
+        self.parameters = self._untrained(centers, spans, quats)
 
-    def with_initialization(self, start: FreeInitialization, quats: Tensor) -> Gaussians4D:
-        """Return an untrained field with the times and spans of ``start``, without velocities.
+    def with_initialization(
+        self, start: FreeInitialization, gaussians: Gaussians
+    ) -> tuple[Gaussians4D, Gaussians]:
+        """Return an untrained field with the times, spans and velocities of ``start``.
 
-        ``quats`` (M, 4): rotations of the canonical Gaussians.
+        ``gaussians`` (M): the canonical Gaussians; isotropic where they have a velocity. Returns
+        them with the rotations and scales that give these velocities, too.
         """
-        network = {name: self.parameters[name] for name in self._network_names}
-        started = self._untrained(start.centers, start.spans, quats.to("cpu"), network)
-        return self.with_parameters(started)
+        gaussians = gaussians.to(device="cpu")
+        spans = start.spans.clamp_min(MIN_SPAN * self.gap)
+        tilted, spans, right_quats = tilt_in_time(gaussians, spans, start.velocities)
+        parameters = self._untrained(start.centers, spans, right_quats)
+        return self.with_parameters(parameters), tilted
 
     def step(self, step: int, progress: float) -> Count:
-        for name in self._network_names:
+        for name in self._network:
             weights = self.parameters[name]
             if weights.grad is not None:
                 weights.grad.add_(weights.detach(), alpha=predictor.WEIGHT_DECAY)
@@ -200,13 +205,11 @@ class Gaussians4D(DeformationField):
         field = Gaussians4D(self.options, setup, torch.Generator())
         return super(Gaussians4D, field).with_state(tensors)
 
-    def _untrained(
-        self, centers: Tensor, spans: Tensor, quats: Tensor, network: Mapping[str, Tensor]
-    ) -> Parameters:
+    def _untrained(self, centers: Tensor, spans: Tensor, right_quats: Tensor) -> Parameters:
         tensors = {
             "times": centers[:, None],
-            "log_spans": spans.clamp_min(MIN_SPAN * self.gap).log()[:, None],
-            "right_quats": quats * quats.new_tensor([1.0, -1.0, -1.0, -1.0]),
+            "log_spans": spans.log()[:, None],
+            "right_quats": right_quats,
         }
         terms = self.options.frequencies * self.setup.num_sh_terms
         if terms:
@@ -217,7 +220,43 @@ class Gaussians4D(DeformationField):
             "right_quats": LR_QUATS,
             "sh_time": LR_SH,
         }
-        roles = dict.fromkeys(tensors, Role.PER_MOVING) | dict.fromkeys(network, Role.SHARED)
-        decays = dict.fromkeys(tensors, LR_DECAY) | dict.fromkeys(network, predictor.LR_DECAY)
-        rates |= dict.fromkeys(network, predictor.LR)
-        return Parameters(tensors | dict(network), rates, decays, roles)
+        roles = dict.fromkeys(tensors, Role.PER_MOVING) | dict.fromkeys(self._network, Role.SHARED)
+        decays = dict.fromkeys(tensors, LR_DECAY) | dict.fromkeys(self._network, predictor.LR_DECAY)
+        rates |= dict.fromkeys(self._network, predictor.LR)
+        return Parameters(tensors | self._network, rates, decays, roles)
+
+
+def tilt_in_time(
+    gaussians: Gaussians, spans: Tensor, velocities: Tensor
+) -> tuple[Gaussians, Tensor, Tensor]:
+    """Give Gaussians (M) ``velocities`` (M, 3), world units per clip, by a rotation in space-time.
+
+    Isotropic Gaussians of size s that last ``spans`` (M,) have the covariance [[s^2 + v^2 d^2,
+    v d^2], [v d^2, d^2]] along the velocity and time. Its axes are turned by an angle: e^{u a / 2}
+    from both sides, with the direction u of the velocity. Returns the Gaussians, the scales along
+    the fourth axis (M,), and the right quaternions (M, 4). Gaussians without velocity stay.
+    """
+    speed = velocities.norm(dim=1)
+    direction = velocities / speed.clamp_min(torch.finfo(speed.dtype).tiny)[:, None]
+    size = gaussians.log_scales[:, 0].exp()
+    in_space = size.square() + (speed * spans).square()
+    in_time = spans.square()
+    mixed = speed * in_time
+    gap = torch.hypot(in_time - in_space, 2 * mixed)
+    longer = (0.5 * (in_space + in_time + gap)).sqrt()
+    shorter = size * spans / longer
+    half_angle = 0.25 * torch.atan2(2 * mixed, in_time - in_space)
+    turn = torch.cat([half_angle.cos()[:, None], half_angle.sin()[:, None] * direction], dim=1)
+    # the rotation that turns the first axis into the direction
+    zero = torch.zeros_like(speed)
+    aligned = torch.stack([1 + direction[:, 0], zero, -direction[:, 2], direction[:, 1]], dim=1)
+    opposite = aligned.new_tensor([0.0, 0.0, 1.0, 0.0])
+    aligned = unit_quats(torch.where((aligned.norm(dim=1) > 1e-3)[:, None], aligned, opposite))
+    moves = (speed > 0)[:, None]
+    conjugate = aligned.new_tensor([1.0, -1.0, -1.0, -1.0])
+    quats = torch.where(moves, quat_product(turn, aligned), gaussians.quats)
+    right = torch.where(moves, quat_product(aligned * conjugate, turn), gaussians.quats * conjugate)
+    along = torch.where(speed > 0, shorter.log(), gaussians.log_scales[:, 0])
+    log_scales = torch.cat([along[:, None], gaussians.log_scales[:, 1:]], dim=1)
+    tilted = gaussians.replace(quats=quats, log_scales=log_scales)
+    return tilted, torch.where(speed > 0, longer, spans), right

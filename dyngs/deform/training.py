@@ -262,7 +262,9 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         if isinstance(field, FreePrimitives) and start is not None:
             field = field.with_initialization(start)
         if isinstance(field, Gaussians4D) and start is not None:
-            field = field.with_initialization(start, gaussians.quats[moving])
+            field, tilted = field.with_initialization(start, gaussians.select(moving))
+            for name in ("quats", "log_scales"):
+                result.changes[name][moving] = getattr(tilted, name).to(moving.device)
         if bodies is not None:
             field = bodies.build_field(field)
             self._set_time_window(bodies.explains_all_motion)

@@ -18,8 +18,8 @@ class EditResult:
     # new values (N_new, ...) by field name, for fields that are not simply gathered from source
     # rows
     changes: dict[str, Tensor] = field(default_factory=dict[str, Tensor])
-    # new values (N_new, ...) of the motion of Gaussians by name; rows of static ones are ignored
-    motion_changes: dict[str, Tensor] = field(default_factory=dict[str, Tensor])
     # fields whose Adam moments are reset to zero in every row
     zero_moments: frozenset[str] = frozenset()
     message: str | None = None  # log message that explains the edit, or None
+    # new values (N_new, ...) of the motion of Gaussians by name; rows of static ones are ignored
+    motion_changes: dict[str, Tensor] = field(default_factory=dict[str, Tensor])
