@@ -47,6 +47,7 @@ class Measurement:
         views: names of the views shown on the page, and their PSNR in dB.
         ms: median milliseconds per image, with deformation. None until measured.
         gain: median speed relative to the first scene, over pairs of consecutive renders.
+        psnr_worst: lowest PSNR of a view.
     """
 
     __pydantic_config__ = STORED_CONFIG
@@ -64,6 +65,7 @@ class Measurement:
     views: tuple[tuple[str, float], ...] = ()
     ms: _Measured | None = None
     gain: _Measured = 1.0
+    psnr_worst: float | None = None
 
 
 _STORED = TypeAdapter(Measurement)
@@ -156,6 +158,7 @@ class SceneMeasurer:
             steps=run.step,
             seconds=run.seconds_train,
             views=tuple(views),
+            psnr_worst=min(score.psnr for score in scores),
         )
 
     def _open_renderer(self, run_dir: Path, folder: Path) -> tuple[SceneRenderer, ImageLoader]:

@@ -31,6 +31,7 @@ MATPLOTLIB_MISSING = "no plot without matplotlib; run pip install 'dyngs[plots]'
 # Headings and formats of the columns
 COLUMNS = {
     "psnr": ("PSNR", ".2f"),
+    "psnr_worst": ("worst", ".2f"),
     "ssim": ("SSIM", ".4f"),
     "lpips": ("LPIPS", ".4f"),
     "psnr_foreground": ("foregr.", ".2f"),

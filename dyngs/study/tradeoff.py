@@ -352,7 +352,7 @@ def build_rows(measurements: Sequence[Measurement]) -> list[Row]:
     base = measurements[0].ms
     fps = 0.0 if base is None else 1e3 / base
     front = pareto_mask([(m.psnr, m.gain, -m.mb) for m in measurements])
-    columns = ("name", *SCORES, "gain", "ms", "mb", "gaussians", "steps", "seconds")
+    columns = ("name", *SCORES, "psnr_worst", "gain", "ms", "mb", "gaussians", "steps", "seconds")
     return [
         {name: getattr(m, name) for name in columns} | {"fps": fps * m.gain, "on_front": on_front}
         for m, on_front in zip(measurements, front, strict=True)

@@ -59,6 +59,7 @@ def test_a_table_curves_and_a_page(finished: Path, capsys: pytest.CaptureFixture
     report = evaluate_run(finished / "runs" / "static", threads=1)
     assert (stored["psnr"], stored["ssim"]) == (report.psnr, report.ssim)
     assert stored["psnr_foreground"] == report.psnr_foreground
+    assert stored["psnr_worst"] == min(view.psnr for view in report.per_view)
     assert "Skipped: dynamic: the images have no times" in (finished / "comparison.md").read_text()
     assert (finished / "comparison.svg").read_text().startswith("<svg")
 

@@ -1,0 +1,328 @@
+"""Comparison of systems for moving scenes at equal minutes of training, by `dyngs compare`.
+
+    python benchmarks/dynamic.py FOLDER --data CAPTURES [--jobs 2] [--minutes 1.5] [--seeds 0 1]
+    python benchmarks/dynamic.py FOLDER --speeds
+    python benchmarks/dynamic.py FOLDER --table
+
+One row per variant, capture and seed is stored as FOLDER/results/CAPTURE_VARIANT_SEED.json; stored
+rows are not trained again. `--captures` takes names of CAPTURES (in the folder of --data) or
+NAME=PATH[,KEY=VALUE...], `--variants` names of VARIANTS or NAME=PRESET[,KEY=VALUE...]. Videos get
+poses once, by `dyngs data sfm`. `--speeds` times the models of each capture alternately, which
+`--jobs` does not disturb; run it when the machine has nothing else to do.
+
+What moves is scored on the same pixels for all variants: motion masks of the capture, else pixels
+of fixed cameras that differ from their median over time. One moving camera without masks has none.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from datetime import date
+from functools import partial
+from pathlib import Path
+from statistics import fmean, median
+from typing import Any
+
+from results import current_commit, processor, table
+
+# Overrides of each capture; a folder or video of this path in the folder of --data
+CAPTURES: dict[str, tuple[str, tuple[str, ...]]] = {
+    "stage": ("stage", ()),
+    "rig": ("rig", ()),
+    "orbits": ("orbits", ()),
+    "flag": ("flag", ()),
+    "clip_dog": ("clip_dog/dog.mp4", ("data.longest_side=480",)),
+    "clip_duck": ("clip_duck", ("data.longest_side=400",)),
+}
+
+
+def dynamic(kind: str, *overrides: str) -> tuple[str, ...]:
+    """Return preset `dynamic` with a deformation field, without pilot runs."""
+    return ("dynamic", "model.pilot_runs=false", f"model.deform.kind={kind}", *overrides)
+
+
+# Preset and overrides by name
+VARIANTS: dict[str, tuple[str, ...]] = {
+    "free": dynamic("free"),
+    "control_nodes": dynamic("control_nodes"),
+    "gaussians_4d": dynamic("gaussians_4d"),
+    "gaussians_4d_all": dynamic("gaussians_4d", "model.select_moving=false"),
+    "hexplane": dynamic("hexplane"),
+    "mlp": dynamic("mlp"),
+}
+# Columns of the table: key of a row, heading, format
+COLUMNS = (
+    ("psnr", "PSNR, dB", ".2f"),
+    ("psnr_moving", "what moves", ".2f"),
+    ("psnr_foreground", "foreground", ".2f"),
+    ("psnr_worst", "worst frame", ".2f"),
+    ("mb", "MB, float32", ".1f"),
+    ("fps", "frames/s", ".0f"),
+    ("seconds", "training, s", ".0f"),
+    ("steps", "steps", ",.0f"),
+    ("gaussians", "Gaussians", ",.0f"),
+)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One training of a variant on a capture."""
+
+    folder: Path
+    capture: str
+    path: Path
+    variant: str
+    preset: str
+    overrides: tuple[str, ...]
+    seed: int
+    minutes: float
+
+    @property
+    def out(self) -> Path:
+        """Folder of `dyngs compare`."""
+        return self.folder / "comparisons" / f"{self.capture}_{self.variant}_{self.seed}"
+
+    @property
+    def result(self) -> Path:
+        return self.folder / "results" / f"{self.capture}_{self.variant}_{self.seed}.json"
+
+    def words(self, capture: str) -> list[str]:
+        """Return the words of the command after `dyngs`, without the output folder."""
+        return [
+            "compare", capture, "--models", self.preset, "--minutes", f"{self.minutes:g}",
+            "--threads", "1", f"run.seed={self.seed}", *self.overrides,
+        ]  # fmt: skip
+
+    @property
+    def command(self) -> str:
+        """The command as it is stored, with the name of the capture in place of its path."""
+        return " ".join(["dyngs", *self.words(self.path.name)])
+
+    def stored(self) -> dict[str, Any] | None:
+        """Return the stored result, or None. Exits if it was measured with another command.
+
+        Refused rows are removed, since they may succeed now.
+        """
+        if not self.result.is_file():
+            return None
+        found = json.loads(self.result.read_text(encoding="utf-8"))
+        if "refused" in found:
+            shutil.rmtree(self.out, ignore_errors=True)
+            self.result.unlink()
+            return None
+        if found["command"] != self.command:
+            sys.exit(
+                f"{self.result}: measured by another command; remove it, or use another FOLDER"
+            )
+        return found
+
+
+def run_row(row: Row) -> bool:
+    """Train, measure and store a row. Returns False for a failure that is not stored.
+
+    A refusal of dyngs (exit code 2) is stored with its reason.
+    """
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    words = [sys.executable, "-m", "dyngs", *row.words(str(row.path)), "--out", str(row.out)]
+    done = subprocess.run(words, env=environment, capture_output=True, text=True)
+    facts: dict[str, Any] = {
+        "capture": row.capture,
+        "variant": row.variant,
+        "seed": row.seed,
+        "minutes": row.minutes,
+        "command": row.command,
+        "commit": current_commit(),
+        "date": date.today().isoformat(),
+        "machine": processor(),
+        "load": os.getloadavg()[0],
+    }
+    last_line = (done.stderr.strip() or "no message").splitlines()[-1]
+    if done.returncode == 0:
+        report = json.loads((row.out / "comparison.json").read_text(encoding="utf-8"))
+        facts |= report["rows"][0]
+        shown = f"{facts['psnr']:.2f} dB, {facts['steps']:,} steps in {facts['seconds']:.0f} s"
+    elif done.returncode == 2:
+        facts["refused"] = last_line.removeprefix("dyngs: error: ")
+        shown = f"refused: {facts['refused']}"
+    else:
+        print(f"{row.result.stem}: exit code {done.returncode}: {last_line}", flush=True)
+        return False
+    write_result(row.result, facts)
+    print(f"{row.result.stem}: {shown}", flush=True)
+    return True
+
+
+def write_result(path: Path, facts: dict[str, Any]) -> None:
+    """Write a result in one step, so that an interruption leaves no half-written file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_suffix(".part")
+    part.write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
+    part.replace(path)
+
+
+def run_rows(rows: Sequence[Row], jobs: int) -> bool:
+    """Run the rows that are not stored, several at a time. Returns whether all succeeded."""
+    missing = [row for row in rows if row.stored() is None]
+    minutes = sum(row.minutes for row in missing) / jobs
+    print(f"{len(missing)} of {len(rows)} rows, {minutes:.0f} minutes of training", flush=True)
+    pool = ThreadPoolExecutor(jobs)
+    try:
+        return all(list(pool.map(run_row, missing)))
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def posed_capture(path: Path, folder: Path, name: str) -> Path:
+    """Return the capture, or for a video the folder with its frames and estimated poses."""
+    if not path.is_file():
+        return path
+    posed = folder / "captures" / name
+    if not posed.exists():
+        words = [sys.executable, "-m", "dyngs", "data", "sfm", str(path), str(posed)]
+        subprocess.run(words, check=True)
+    return posed
+
+
+def load_results(folder: Path) -> list[dict[str, Any]]:
+    """Return all stored results, in the order of CAPTURES and VARIANTS, then by name."""
+    paths = sorted((folder / "results").glob("*.json"))
+    found = [json.loads(path.read_text(encoding="utf-8")) for path in paths]
+    captures = list(CAPTURES)
+    variants = list(VARIANTS)
+    captures += sorted({x["capture"] for x in found} - set(captures))
+    variants += sorted({x["variant"] for x in found} - set(variants))
+    return sorted(
+        found,
+        key=lambda x: (captures.index(x["capture"]), variants.index(x["variant"]), x["seed"]),
+    )
+
+
+def spread_cell(values: Sequence[float | None], form: str) -> str:
+    """Format the mean of the values, and half their range if there are several."""
+    known = [value for value in values if value is not None]
+    if not known:
+        return ""
+    mean = format(fmean(known), form)
+    if len(known) == 1:
+        return mean
+    return f"{mean} ± {format((max(known) - min(known)) / 2, form)}"
+
+
+def results_table(found: Sequence[dict[str, Any]]) -> str:
+    """Return a Markdown table with one row per variant and capture."""
+    groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for result in found:
+        groups.setdefault((result["capture"], result["variant"]), []).append(result)
+    rows = [["capture", "variant", "seeds", *(heading for _, heading, _ in COLUMNS)]]
+    refused = []
+    for (capture, variant), results in groups.items():
+        measured = [result for result in results if "refused" not in result]
+        if not measured:
+            refused.append(f"{capture}, {variant}: {results[0]['refused']}")
+            continue
+        cells = [
+            spread_cell([result[key] for result in measured], form) for key, _, form in COLUMNS
+        ]
+        rows.append([capture, variant, str(len(measured)), *cells])
+    loads = [result["load"] for result in found]
+    notes = [
+        "Mean over seeds ± half the range. What moves is empty where neither motion masks nor fixed",
+        "cameras show it; foreground is empty for images without alpha. Load of the machine during the",
+        f"trainings: {min(loads, default=0):.1f} to {max(loads, default=0):.1f}.",
+        *(f"\nNot trained: {line}" for line in refused),
+    ]
+    return table(rows) + "\n\n" + "\n".join(notes) + "\n"
+
+
+def time_models(folder: Path, threads: int) -> None:
+    """Time the models of the first seed of each capture alternately, and store frames a second."""
+    from dyngs.api.load import read_capture
+    from dyngs.data.loader import ImageLoader
+    from dyngs.data.times import evenly_spaced
+    from dyngs.evaluate.view_scores import SceneRenderer, time_renders
+    from dyngs.models.views import evaluation_background
+    from dyngs.ops.native import kernel_threads
+    from dyngs.runs.checkpoint import load_run
+    from dyngs.runs.opened import scene_of_split, split_views
+
+    found = [result for result in load_results(folder) if "refused" not in result]
+    for capture_name in dict.fromkeys(result["capture"] for result in found):
+        chosen = [result for result in found if result["capture"] == capture_name]
+        stems = [f"{x['capture']}_{x['variant']}_{x['seed']}" for x in chosen]
+        runs = [
+            load_run(next((folder / "comparisons" / stem / "runs").iterdir())) for stem in stems
+        ]
+        data = runs[0].config.data
+        capture = read_capture(data)
+        loader = ImageLoader(split_views(capture, "test"), data)
+        images = [loader[i] for i in evenly_spaced(len(loader), 4)]
+        _, background = evaluation_background(data.background, capture.has_alpha)
+        drawings = []
+        for run in runs:
+            scene = scene_of_split(run, capture, "test")
+            drawings.append(SceneRenderer(scene, scene.options, background))
+        with kernel_threads(threads):
+            seconds = time_renders(drawings, images, rounds=5)
+        for result, stem, own in zip(chosen, stems, seconds, strict=True):
+            result["fps"] = 1 / median(own.tolist())
+            write_result(folder / "results" / f"{stem}.json", result)
+            print(f"{stem}: {result['fps']:.0f} frames/s", flush=True)
+
+
+def parse_named(word: str, known: dict[str, tuple[str, ...]]) -> tuple[str, tuple[str, ...]]:
+    """Return name and words of NAME or NAME=FIRST[,KEY=VALUE...]."""
+    name, equals, rest = word.partition("=")
+    if equals:
+        return name, tuple(rest.split(","))
+    if name not in known:
+        sys.exit(f"{name}: unknown; use {', '.join(known)} or NAME=...")
+    return name, known[name]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("folder", type=Path, metavar="FOLDER")
+    parser.add_argument("--data", type=Path, default=Path("."), help="folder of the captures")
+    parser.add_argument("--captures", nargs="+", default=list(CAPTURES), metavar="CAPTURE")
+    parser.add_argument("--variants", nargs="+", default=list(VARIANTS), metavar="VARIANT")
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1])
+    parser.add_argument("--minutes", type=float, default=1.5, help="of each training")
+    parser.add_argument("--jobs", type=int, default=1, help="trainings at a time, one thread each")
+    parser.add_argument("--speeds", action="store_true", help="time stored models, do not train")
+    parser.add_argument("--table", action="store_true", help="print the table, do not train")
+    options = parser.parse_args()
+    if options.table:
+        print(results_table(load_results(options.folder)))
+        return
+    if options.speeds:
+        time_models(options.folder, threads=1)
+        return
+    known = {name: (str(options.data / path), *words) for name, (path, words) in CAPTURES.items()}
+    captures = dict(parse_named(word, known) for word in options.captures)
+    variants = dict(parse_named(word, VARIANTS) for word in options.variants)
+    folder = options.folder.absolute()
+    rows = []
+    for seed in options.seeds:
+        for name, (path, *of_capture) in captures.items():
+            posed = posed_capture(Path(path).absolute(), folder, name)
+            make = partial(Row, folder, name, posed, seed=seed, minutes=options.minutes)
+            for variant, (preset, *of_variant) in variants.items():
+                rows.append(
+                    make(variant=variant, preset=preset, overrides=(*of_capture, *of_variant))
+                )
+    if not run_rows(rows, options.jobs):
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()
