@@ -32,6 +32,7 @@ from dyngs.ops.rays import MarchSteps, Rays, Space, composite, march, reached
 from dyngs.ops.registration import count_nonfinite_op
 from dyngs.ops.shading import shading_inputs
 from dyngs.ops.skinning import add_offsets_, blend_skinning, offset_gradients
+from dyngs.ops.slicing import condition_gaussians, slice_gaussians
 
 
 @dataclass(frozen=True)
@@ -224,6 +225,18 @@ def posing_case(count: int, dtype: torch.dtype) -> Case:
     return Case(run, (*rest, weights, transforms))
 
 
+def slicing_case(count: int, dtype: torch.dtype) -> Case:
+    """4D Gaussians at a time at which a few are not seen, and their shapes at all times."""
+    numbers = Numbers(dtype)
+    sizes = (3,), (), (4,), (4,), (3,), (), ()
+    inputs = [leaf(numbers.normal(count, *size)) for size in sizes]
+
+    def run(*inputs: Tensor) -> list[Tensor]:
+        return [*slice_gaussians(*inputs, time=0.3), *condition_gaussians(*inputs[2:6])]
+
+    return Case(run, tuple(inputs))
+
+
 def perceptron_case(count: int, dtype: torch.dtype, skip: int | None = 2) -> Case:
     numbers = Numbers(dtype)
     widths = (7, 20, 33, 20, 5) if count > 4 else (3, 4, 5, 2)
@@ -296,6 +309,7 @@ CASES: dict[str, Callable[[int, torch.dtype], Case]] = {
     "planes": planes_case,
     "skinning": skinning_case,
     "posing": posing_case,
+    "slicing": slicing_case,
     "perceptron": perceptron_case,
     "field": field_case,
     "patches": patches_case,

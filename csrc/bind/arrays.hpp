@@ -76,11 +76,12 @@ void bind_posing(nb::module_& module);
 void bind_rasterizer(nb::module_& module);
 void bind_shading(nb::module_& module);
 void bind_skinning(nb::module_& module);
+void bind_slicing(nb::module_& module);
 void bind_train(nb::module_& module);
 void bind_triangles(nb::module_& module);
 inline void bind_ops(nb::module_& module) {
   for (const auto bind : {bind_fields, bind_nodes, bind_offsets, bind_perceptron, bind_planes, bind_posing,
-                          bind_rasterizer, bind_shading, bind_skinning, bind_train, bind_triangles})
+                          bind_rasterizer, bind_shading, bind_skinning, bind_slicing, bind_train, bind_triangles})
     bind(module);
 }
 

@@ -153,6 +153,22 @@ void pose_backward(const Posing<float>& in, const Posed<const float>& posed, con
 }
 
 template <>
+void slice_forward(const SpaceTimeGaussians<float>& in, const SliceTime<float>& at, const Slice<float>& out, int) {
+  cuda::slice_forward(in, at, out, current_stream());
+}
+
+template <>
+void slice_backward(const SpaceTimeGaussians<float>& in, const SliceTime<float>& at, const Slice<const float>& slice,
+                    const SliceGrads<float>& g, const SpaceTimeGrads<float>& out, int) {
+  cuda::slice_backward(in, at, slice, g, out, current_stream());
+}
+
+template <>
+void condition(const SpaceTimeGaussians<float>& in, const Conditional<float>& out, int) {
+  cuda::condition(in, out, current_stream());
+}
+
+template <>
 void add_offsets(const RowOffsets<float>& offsets, const MovedGaussians<float>& gaussians, int) {
   cuda::add_offsets(offsets, gaussians, current_stream());
 }

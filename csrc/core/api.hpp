@@ -394,6 +394,59 @@ template <class S>
 void pose_backward(const Posing<S>& in, const Posed<const S>& posed, const PosedGrads<S>& g, const PosingGrads<S>& out,
                    int threads);
 
+// Slicing of 4D Gaussians ---------------------------------------------------------------------------------------------
+// Gaussians of space and time (Yang et al. 2024), conditioned on a time (math/slicing.hpp).
+
+template <class S>
+struct SpaceTimeGaussians {
+  int64_t count;                 // M
+  const S *means, *times;        // (M, 3), (M,)
+  const S *quats, *right_quats;  // (M, 4) q_l and q_r of any length (zero = identity): the rotation is v -> q_l v q_r
+  const S *log_scales, *log_spans;  // (M, 3), (M,) of the axes x, y, z and t
+  const S* logit_opacities;         // (M,)
+};
+
+// `basis` is for the backward pass: the axes as orthonormal combinations of those of the 4D Gaussian.
+template <class S>
+struct Slice {
+  S *means, *quats, *log_scales, *logit_opacities;  // (M, 3), (M, 4), (M, 3), (M,)
+  S* basis;                                         // (M, 4, 3)
+};
+
+template <class S>
+struct SliceGrads {
+  const S *means, *quats, *log_scales, *logit_opacities;  // shapes of Slice
+};
+
+template <class S>
+struct SpaceTimeGrads {
+  S *means, *times, *quats, *right_quats, *log_scales, *log_spans, *logit_opacities;  // shapes of SpaceTimeGaussians
+};
+
+// Where exp(-z) of the weight in time is at most exp(-most_faded), the logit is -1e4, without gradient.
+template <class S>
+struct SliceTime {
+  S time, most_faded;
+};
+
+template <class S>
+void slice_forward(const SpaceTimeGaussians<S>& in, const SliceTime<S>& at, const Slice<S>& out, int threads);
+
+// `slice` is what the forward pass wrote; its means and logits are not read.
+template <class S>
+void slice_backward(const SpaceTimeGaussians<S>& in, const SliceTime<S>& at, const Slice<const S>& slice,
+                    const SliceGrads<S>& g, const SpaceTimeGrads<S>& out, int threads);
+
+// What a slice has in common at all times.
+template <class S>
+struct Conditional {
+  S *quats, *log_scales, *velocities, *log_deviations;  // (M, 4), (M, 3), (M, 3), (M,) of time
+};
+
+// Of `in`, only rotations and scales are read.
+template <class S>
+void condition(const SpaceTimeGaussians<S>& in, const Conditional<S>& out, int threads);
+
 // Offsets of a deformation field (dyngs/deform has the formulas in torch) -----------------------------------------------
 
 // Of M rows; null: no change of that.

@@ -6,6 +6,7 @@
 #include <algorithm>
 #include <vector>
 
+#include "cpu/lanes.hpp"
 #include "cpu/parallel.hpp"
 #include "cpu/simd.hpp"
 #include "cpu/transpose.hpp"
@@ -30,21 +31,7 @@ void store_some(S* to, const Packet<S>& x, int64_t count) {
   for (int i = 0; i < count; ++i) to[i] = x[i];
 }
 
-// Rows of kWidth numbers of `count` Gaussians, as packets of one number each; what is missing repeats the last row.
-template <int kWidth, class S>
-void load_lanes(const S* from, int64_t first, int count, Packet<S> (&to)[kWidth]) {
-  for (int i = 0; i < kLanes; ++i) {
-    const S* row = from + kWidth * (first + std::min(i, count - 1));
-    for (int k = 0; k < kWidth; ++k) to[k][i] = row[k];
-  }
-}
-template <int kWidth, class S>
-void store_lanes(S* to, int64_t first, int count, const Packet<S> (&from)[kWidth]) {
-  for (int i = 0; i < count; ++i)
-    for (int k = 0; k < kWidth; ++k) to[kWidth * (first + i) + k] = from[k][i];
-}
-
-// The same for rows of twelve, through a transpose; zeros for missing rows.
+// Rows of twelve numbers of `count`, through a transpose; zeros for missing rows.
 template <class S>
 void load_twelve(const S* from, int64_t first, int count, Packet<S> (&to)[kLanes]) {
   from += kAffine * first;

@@ -103,6 +103,12 @@ int64_t pose_backward_workspace(int64_t count, int64_t joints);
 void pose_backward(const Posing<float>& in, const Posed<const float>& posed, const PosedGrads<float>& g,
                    const PosingGrads<float>& out, const Lent& workspace, Stream stream);
 
+void slice_forward(const SpaceTimeGaussians<float>& in, const SliceTime<float>& at, const Slice<float>& out,
+                   Stream stream);
+void slice_backward(const SpaceTimeGaussians<float>& in, const SliceTime<float>& at, const Slice<const float>& slice,
+                    const SliceGrads<float>& g, const SpaceTimeGrads<float>& out, Stream stream);
+void condition(const SpaceTimeGaussians<float>& in, const Conditional<float>& out, Stream stream);
+
 void nodes_at(const NodeSplines<float>& splines, float* motion, float* values, Stream stream);
 void nodes_at_backward(const NodeSplines<float>& splines, const float* by_motion, const float* by_values,
                        const SplineGrads<float>& grads, Stream stream);

@@ -1,0 +1,114 @@
+// Python bindings of the slicing of 4D Gaussians. Argument unpacking only.
+#include "bind/arrays.hpp"
+#include "core/api.hpp"
+
+namespace dyngs {
+namespace {
+
+constexpr const char* kOp = "slicing";
+
+template <class S>
+using Line = Array<S, nb::ndim<1>>;
+// Quaternions, right quaternions, log scales, log spans.
+template <class S>
+using Shapes = std::tuple<Rows<S>, Rows<S>, Rows<S>, Line<S>>;
+// Means, times, shapes, logits; of gradients likewise.
+template <class S>
+using Inputs = std::tuple<Rows<S>, Line<S>, Shapes<S>, Line<S>>;
+// Means, quaternions, log scales, logits.
+template <class S>
+using Sliced = std::tuple<Rows<S>, Rows<S>, Rows<S>, Line<S>>;
+template <class S>
+using Basis = Array<S, nb::shape<-1, 4, 3>>;
+
+template <class S>
+SpaceTimeGaussians<S> shape_input(const Shapes<const S>& arrays) {
+  const auto& [quats, right_quats, log_scales, log_spans] = arrays;
+  SpaceTimeGaussians<S> in{};
+  in.count = quats.shape(0);
+  in.quats = checked(quats, in.count, 4, kOp), in.right_quats = checked(right_quats, in.count, 4, kOp);
+  in.log_scales = checked(log_scales, in.count, 3, kOp);
+  in.log_spans = checked(Array<const S>(log_spans), in.count, "slicing: log_spans");
+  return in;
+}
+
+template <class S>
+SpaceTimeGaussians<S> slicing_input(const Inputs<const S>& arrays) {
+  const auto& [means, times, shapes, logits] = arrays;
+  SpaceTimeGaussians<S> in = shape_input<S>(shapes);
+  in.means = checked(means, in.count, 3, kOp);
+  in.times = checked(Array<const S>(times), in.count, "slicing: times");
+  in.logit_opacities = checked(Array<const S>(logits), in.count, "slicing: logit_opacities");
+  return in;
+}
+
+template <class T>
+Slice<T> slice_arrays(const Sliced<T>& arrays, const Basis<T>& basis, int64_t count) {
+  const auto& [means, quats, log_scales, logits] = arrays;
+  return {checked(means, count, 3, kOp), checked(quats, count, 4, kOp), checked(log_scales, count, 3, kOp),
+          checked(Array<T>(logits), count, "slicing: logit_opacities"), checked(basis, count, 4, kOp)};
+}
+
+template <class S>
+void slice_forward_arrays(const Inputs<const S>& inputs, double time, double most_faded, const Sliced<S>& sliced,
+                          const Basis<S>& basis, int threads) {
+  const SpaceTimeGaussians<S> in = slicing_input<S>(inputs);
+  const SliceTime<S> at{static_cast<S>(time), static_cast<S>(most_faded)};
+  const Slice<S> out = slice_arrays<S>(sliced, basis, in.count);
+  nb::gil_scoped_release release;
+  slice_forward(in, at, out, threads);
+}
+
+template <class S>
+void slice_backward_arrays(const Inputs<const S>& inputs, double time, double most_faded, const Sliced<const S>& sliced,
+                           const Basis<const S>& basis, const Sliced<const S>& g, const Inputs<S>& grads, int threads) {
+  const SpaceTimeGaussians<S> in = slicing_input<S>(inputs);
+  const SliceTime<S> at{static_cast<S>(time), static_cast<S>(most_faded)};
+  const Slice<const S> slice = slice_arrays<const S>(sliced, basis, in.count);
+  const Slice<const S> by = slice_arrays<const S>(g, basis, in.count);
+  const auto& [means, times, shapes, logits] = grads;
+  const auto& [quats, right_quats, log_scales, log_spans] = shapes;
+  const SpaceTimeGrads<S> out{checked(means, in.count, 3, kOp),
+                              checked(Array<S>(times), in.count, "slicing: times"),
+                              checked(quats, in.count, 4, kOp),
+                              checked(right_quats, in.count, 4, kOp),
+                              checked(log_scales, in.count, 3, kOp),
+                              checked(Array<S>(log_spans), in.count, "slicing: log_spans"),
+                              checked(Array<S>(logits), in.count, "slicing: logit_opacities")};
+  nb::gil_scoped_release release;
+  slice_backward<S>(in, at, slice, {by.means, by.quats, by.log_scales, by.logit_opacities}, out, threads);
+}
+
+template <class S>
+void condition_arrays(const Shapes<const S>& shapes, const Sliced<S>& outputs, int threads) {
+  const SpaceTimeGaussians<S> in = shape_input<S>(shapes);
+  const auto& [velocities, quats, log_scales, log_deviations] = outputs;
+  const Conditional<S> out{checked(quats, in.count, 4, kOp), checked(log_scales, in.count, 3, kOp),
+                           checked(velocities, in.count, 3, kOp),
+                           checked(Array<S>(log_deviations), in.count, "slicing: log_deviations")};
+  nb::gil_scoped_release release;
+  condition(in, out, threads);
+}
+
+template <class S>
+void bind_slicing_of(nb::module_& module) {
+  module.def("slice_forward", slice_forward_arrays<S>, array("gaussians"), nb::arg("time"), nb::arg("most_faded"),
+             array("sliced"), array("basis"), nb::arg("num_threads"),
+             "Writes means (M, 3), quaternions (M, 4), log scales (M, 3) and opacity logits (M,) at a time, and what "
+             "the backward pass needs (M, 4, 3), from means, times (M,), quaternions, right quaternions, log scales, "
+             "log spans (M,) and logits.");
+  module.def("slice_backward", slice_backward_arrays<S>, array("gaussians"), nb::arg("time"), nb::arg("most_faded"),
+             array("sliced"), array("basis"), array("g"), array("grads"), nb::arg("num_threads"),
+             "Writes gradients by all inputs.");
+  module.def("condition", condition_arrays<S>, array("shapes"), array("outputs"), nb::arg("num_threads"),
+             "Writes velocities (M, 3), quaternions (M, 4), log scales (M, 3) and log standard deviations of time "
+             "(M,), from quaternions, right quaternions, log scales and log spans.");
+}
+
+}  // namespace
+
+void bind_slicing(nb::module_& module) {
+  for_each_scalar([&]<class S>() { bind_slicing_of<S>(module); });
+}
+
+}  // namespace dyngs

@@ -1,0 +1,102 @@
+// Slicing of 4D Gaussians (math/slicing.hpp), one thread per Gaussian.
+//
+// Limits, H100 (3.35 TB/s, 67 TFLOP/s), per Gaussian: forward 68 bytes read and 92 written, 48 ps; 600 operations, 9 ps: bound
+// by memory. Backward 188 bytes read and 68 written, 76 ps.
+#include "cuda/api.hpp"
+#include "cuda/device.hpp"
+#include "math/slicing.hpp"
+
+namespace dyngs::cuda {
+namespace {
+
+constexpr int kThreads = 128;
+
+__device__ Vec3<float> load3(const float* rows, int64_t i) {
+  const Array<const float> from = global(rows) + 3 * i;
+  return {from[0], from[1], from[2]};
+}
+__device__ void store3(float* rows, int64_t i, const Vec3<float>& v) {
+  const Array<float> to = global(rows) + 3 * i;
+  to[0] = v.x, to[1] = v.y, to[2] = v.z;
+}
+__device__ Quat<float> load4(const float* rows, int64_t i) {
+  const Array<const float> q = global(rows) + 4 * i;
+  return {q[0], q[1], q[2], q[3]};
+}
+__device__ void store4(float* rows, int64_t i, const Quat<float>& q) {
+  const Array<float> to = global(rows) + 4 * i;
+  to[0] = q.w, to[1] = q.x, to[2] = q.y, to[3] = q.z;
+}
+
+__device__ SpaceTime<float> load_space_time(const SpaceTimeGaussians<float>& in, int64_t i) {
+  const Vec3<float> logs = load3(in.log_scales, i);
+  const float log_scales[4] = {logs.x, logs.y, logs.z, global(in.log_spans)[i]};
+  return space_time(load4(in.quats, i), load4(in.right_quats, i), log_scales);
+}
+
+__global__ void __launch_bounds__(kThreads)
+    slice_kernel(SpaceTimeGaussians<float> in, SliceTime<float> at, Slice<float> out) {
+  const int64_t i = int64_t{blockIdx.x} * kThreads + threadIdx.x;
+  if (i >= in.count) return;
+  const SpaceTime<float> f = load_space_time(in, i);
+  const SlicedShape<float> shape = sliced_shape(f);
+  const float delay = at.time - global(in.times)[i];
+  store3(out.means, i, sliced_mean(load3(in.means, i), f.velocity, delay));
+  global(out.logit_opacities)[i] = visibility(f, delay, global(in.logit_opacities)[i], at.most_faded).logit;
+  store4(out.quats, i, shape.quat);
+  store3(out.log_scales, i, load_vec3(shape.log_scales));
+  DYNGS_UNROLL
+  for (int k = 0; k < 4; ++k) store3(out.basis, 4 * i + k, shape.basis[k]);
+}
+
+__global__ void __launch_bounds__(kThreads)
+    slice_backward_kernel(SpaceTimeGaussians<float> in, SliceTime<float> at, Slice<const float> slice,
+                          SliceGrads<float> g, SpaceTimeGrads<float> out) {
+  const int64_t i = int64_t{blockIdx.x} * kThreads + threadIdx.x;
+  if (i >= in.count) return;
+  const SpaceTime<float> f = load_space_time(in, i);
+  const Vec3<float> logs = load3(slice.log_scales, i), by_logs = load3(g.log_scales, i);
+  SlicedShape<float> shape{load4(slice.quats, i), {logs.x, logs.y, logs.z}, {}};
+  DYNGS_UNROLL
+  for (int k = 0; k < 4; ++k) shape.basis[k] = load3(slice.basis, 4 * i + k);
+  const SliceGrad<float> by{
+      load3(g.means, i), load4(g.quats, i), {by_logs.x, by_logs.y, by_logs.z}, global(g.logit_opacities)[i]};
+  const float delay = at.time - global(in.times)[i];
+  const SpaceTimeGrad<float> found = slice_vjp(f, shape, delay, global(in.logit_opacities)[i], at.most_faded, by);
+  store3(out.means, i, found.mean);
+  global(out.times)[i] = found.time;
+  store4(out.quats, i, found.left), store4(out.right_quats, i, found.right);
+  store3(out.log_scales, i, load_vec3(found.log_scales));
+  global(out.log_spans)[i] = found.log_scales[3];
+  global(out.logit_opacities)[i] = found.logit;
+}
+
+__global__ void __launch_bounds__(kThreads) condition_kernel(SpaceTimeGaussians<float> in, Conditional<float> out) {
+  const int64_t i = int64_t{blockIdx.x} * kThreads + threadIdx.x;
+  if (i >= in.count) return;
+  const SpaceTime<float> f = load_space_time(in, i);
+  const SlicedShape<float> shape = sliced_shape(f);
+  store4(out.quats, i, shape.quat);
+  store3(out.log_scales, i, load_vec3(shape.log_scales));
+  store3(out.velocities, i, f.velocity);
+  global(out.log_deviations)[i] = log_deviation(f);
+}
+
+}  // namespace
+
+void slice_forward(const SpaceTimeGaussians<float>& in, const SliceTime<float>& at, const Slice<float>& out,
+                   Stream stream) {
+  launch("slice", {blocks_for(in.count, kThreads), kThreads}, stream, slice_kernel, in, at, out);
+}
+
+void slice_backward(const SpaceTimeGaussians<float>& in, const SliceTime<float>& at, const Slice<const float>& slice,
+                    const SliceGrads<float>& g, const SpaceTimeGrads<float>& out, Stream stream) {
+  launch("slice_backward", {blocks_for(in.count, kThreads), kThreads}, stream, slice_backward_kernel, in, at, slice, g,
+         out);
+}
+
+void condition(const SpaceTimeGaussians<float>& in, const Conditional<float>& out, Stream stream) {
+  launch("condition", {blocks_for(in.count, kThreads), kThreads}, stream, condition_kernel, in, out);
+}
+
+}  // namespace dyngs::cuda
