@@ -49,9 +49,7 @@ def _slicing_backward(x: Backward) -> Sequence[Tensor]:
 
 
 _NAMES = "means times quats right_quats log_scales log_spans logit_opacities"
-slicing_op = register(
-    "slicing", _slicing, _slicing_backward, _NAMES, keeps=range(5), constant=[4]
-)
+slicing_op = register("slicing", _slicing, _slicing_backward, _NAMES, keeps=range(5), constant=[4])
 """Sliced means, quaternions, log scales, opacity logits, and state of the backward pass (M, 4,
 3)."""
 
