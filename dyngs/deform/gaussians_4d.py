@@ -41,7 +41,7 @@ MIN_SPAN = 0.25  # smallest standard deviation along time, in time steps
 
 
 class _Shape(NamedTuple):
-    """What the predictor multiplies, of A Gaussians, in the order of its outputs."""
+    """Parameters of A Gaussians that the predictor multiplies, in the order of its outputs."""
 
     means: Tensor  # (A, 3)
     times: Tensor  # (A, 1)

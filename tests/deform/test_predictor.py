@@ -158,7 +158,7 @@ def test_gradients_stop_at_the_inputs_of_the_network() -> None:
 
 
 def test_weights_decay_towards_zero() -> None:
-    """As in Adam's L2 term: a weight of 1 without loss has a gradient of 1e-6."""
+    """A weight of 1 has a gradient of 1e-6 without any loss."""
     field = make_field()
     weight = field.parameters["joined_weight2"]
     weight.data.fill_(1.0)
