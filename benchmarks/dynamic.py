@@ -2,13 +2,14 @@
 
     python benchmarks/dynamic.py FOLDER --data CAPTURES [--jobs 2] [--minutes 1.5] [--seeds 0 1]
     python benchmarks/dynamic.py FOLDER --speeds
-    python benchmarks/dynamic.py FOLDER --table
+    python benchmarks/dynamic.py FOLDER --table [--store]
 
 One row per variant, capture and seed is stored as FOLDER/results/CAPTURE_VARIANT_SEED.json; stored
 rows are not trained again. `--captures` takes names of CAPTURES (in the folder of --data) or
 NAME=PATH[,KEY=VALUE...], `--variants` names of VARIANTS or NAME=PRESET[,KEY=VALUE...]. Videos get
 poses once, by `dyngs data sfm`. `--speeds` times the models of each capture alternately, which
-`--jobs` does not disturb; run it when the machine has nothing else to do.
+`--jobs` does not disturb; run it when the machine has nothing else to do. `--store` keeps the rows
+for docs/results.md, which `python benchmarks/results.py write` writes.
 
 What moves is scored on the same pixels for all variants: motion masks of the capture, else pixels
 of fixed cameras that differ from their median over time. One moving camera without masks has none.
@@ -28,10 +29,10 @@ from dataclasses import dataclass
 from datetime import date
 from functools import partial
 from pathlib import Path
-from statistics import fmean, median
+from statistics import median
 from typing import Any
 
-from results import current_commit, processor, table
+from results import MOVING, comparison_table, current_commit, processor
 
 # Overrides of each capture; a folder or video of this path in the folder of --data
 CAPTURES: dict[str, tuple[str, tuple[str, ...]]] = {
@@ -58,18 +59,6 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "hexplane": dynamic("hexplane"),
     "mlp": dynamic("mlp"),
 }
-# Columns of the table: key of a row, heading, format
-COLUMNS = (
-    ("psnr", "PSNR, dB", ".2f"),
-    ("psnr_moving", "what moves", ".2f"),
-    ("psnr_foreground", "foreground", ".2f"),
-    ("psnr_worst", "worst frame", ".2f"),
-    ("mb", "MB, float32", ".1f"),
-    ("fps", "frames/s", ".0f"),
-    ("seconds", "training, s", ".0f"),
-    ("steps", "steps", ",.0f"),
-    ("gaussians", "Gaussians", ",.0f"),
-)
 
 
 @dataclass(frozen=True)
@@ -160,7 +149,7 @@ def run_row(row: Row) -> bool:
     return True
 
 
-def write_result(path: Path, facts: dict[str, Any]) -> None:
+def write_result(path: Path, facts: dict[str, Any] | list[dict[str, Any]]) -> None:
     """Write a result in one step, so that an interruption leaves no half-written file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_suffix(".part")
@@ -203,43 +192,6 @@ def load_results(folder: Path) -> list[dict[str, Any]]:
         found,
         key=lambda x: (captures.index(x["capture"]), variants.index(x["variant"]), x["seed"]),
     )
-
-
-def spread_cell(values: Sequence[float | None], form: str) -> str:
-    """Format the mean of the values, and half their range if there are several."""
-    known = [value for value in values if value is not None]
-    if not known:
-        return ""
-    mean = format(fmean(known), form)
-    if len(known) == 1:
-        return mean
-    return f"{mean} ± {format((max(known) - min(known)) / 2, form)}"
-
-
-def results_table(found: Sequence[dict[str, Any]]) -> str:
-    """Return a Markdown table with one row per variant and capture."""
-    groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
-    for result in found:
-        groups.setdefault((result["capture"], result["variant"]), []).append(result)
-    rows = [["capture", "variant", "seeds", *(heading for _, heading, _ in COLUMNS)]]
-    refused = []
-    for (capture, variant), results in groups.items():
-        measured = [result for result in results if "refused" not in result]
-        if not measured:
-            refused.append(f"{capture}, {variant}: {results[0]['refused']}")
-            continue
-        cells = [
-            spread_cell([result[key] for result in measured], form) for key, _, form in COLUMNS
-        ]
-        rows.append([capture, variant, str(len(measured)), *cells])
-    loads = [result["load"] for result in found]
-    notes = [
-        "Mean over seeds ± half the range. What moves is empty where neither motion masks nor fixed",
-        "cameras show it; foreground is empty for images without alpha. Load of the machine during the",
-        f"trainings: {min(loads, default=0):.1f} to {max(loads, default=0):.1f}.",
-        *(f"\nNot trained: {line}" for line in refused),
-    ]
-    return table(rows) + "\n\n" + "\n".join(notes) + "\n"
 
 
 def time_models(folder: Path, threads: int) -> None:
@@ -300,9 +252,13 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=1, help="trainings at a time, one thread each")
     parser.add_argument("--speeds", action="store_true", help="time stored models, do not train")
     parser.add_argument("--table", action="store_true", help="print the table, do not train")
+    parser.add_argument("--store", action="store_true", help="with --table: for docs/results.md")
     options = parser.parse_args()
     if options.table:
-        print(results_table(load_results(options.folder)))
+        rows = load_results(options.folder)
+        print(comparison_table(rows))
+        if options.store:
+            write_result(MOVING, rows)
         return
     if options.speeds:
         time_models(options.folder, threads=1)

@@ -6,7 +6,8 @@
 
 ``run`` trains and evaluates one measurement of ``MEASUREMENTS`` and stores
 ``benchmarks/results/NAME.json``. CAPTURES holds a folder or video per capture. ``write`` writes
-docs/benchmarks/*.md and the table of README.md from all stored files, so that they cannot differ.
+docs/benchmarks/*.md, docs/results.md and the table of README.md from all stored files, so that they
+cannot differ. Published figures for docs/results.md are in ``benchmarks/results/published.yaml``.
 """
 
 from __future__ import annotations
@@ -18,13 +19,20 @@ import platform
 import resource
 import subprocess
 import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from datetime import date
 from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+import yaml
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks/results"
 PAGES = ROOT / "docs/benchmarks"
+PUBLISHED = RESULTS / "published.yaml"
+MOVING = RESULTS / "comparisons/moving.json"  # rows of benchmarks/dynamic.py
 TABLE_BEGIN = "<!-- results: written by benchmarks/results.py -->"
 TABLE_END = "<!-- end of results -->"
 
@@ -33,7 +41,7 @@ TABLE_END = "<!-- end of results -->"
 class Measurement:
     """One training run and its evaluation on the whole test split."""
 
-    page: str  # static, moving or people
+    page: str  # static, moving or people; systems: in docs/results.md only
     title: str
     capture: str  # name of a folder or file in CAPTURES
     preset: str
@@ -90,6 +98,27 @@ MEASUREMENTS = {
     "casual_m": Measurement(
         "people", "casual_m (synthetic): a walking man, eight cameras", "human/casual_m", "human",
         in_readme=True,
+    ),
+    "lego400_mip": Measurement("systems", "lego", "lego400", "mip"),
+    "lego400_mcmc": Measurement("systems", "lego", "lego400", "static_mcmc"),
+    "lego400_ngp": Measurement(
+        "systems", "lego", "lego400", "ngp", ("data.longest_side=200",)
+    ),
+    "lego400_nerf": Measurement("systems", "lego", "lego400", "nerf"),
+    "lego400_bg_triangle": Measurement(
+        "systems", "lego", "lego400", "bg_triangle", ("data.longest_side=200",)
+    ),
+    "orbits_hexplane": Measurement(
+        "systems", "orbits", "orbits", "dynamic",
+        ("model.pilot_runs=false", "model.deform.kind=hexplane"),
+    ),
+    "orbits_mlp": Measurement(
+        "systems", "orbits", "orbits", "dynamic",
+        ("model.pilot_runs=false", "model.deform.kind=mlp"),
+    ),
+    "stage_free": Measurement(
+        "systems", "stage", "stage", "dynamic",
+        ("model.pilot_runs=false", "model.deform.kind=free", "train.steps=10000"),
     ),
 }  # fmt: skip
 
@@ -278,6 +307,8 @@ def size_page(results: dict[str, Result]) -> str:
     """Sizes of models in memory and of their files, and CPU seconds of a step."""
     rows = [["capture", "Gaussians", "float32, MB", "scene.dyngs, MB", "CPU ms per step"]]
     for name, result in results.items():
+        if MEASUREMENTS[name].page not in DETAILS:
+            continue
         per_step = None if result.cpu_seconds is None else result.cpu_seconds / result.steps * 1000
         rows.append(
             [
@@ -325,10 +356,141 @@ def readme_table(results: dict[str, Result]) -> str:
     return table(rows)
 
 
+# Columns of a comparison: key of a row, heading, format
+COMPARED = (
+    ("psnr", "PSNR, dB", ".2f"),
+    ("psnr_moving", "what moves", ".2f"),
+    ("psnr_foreground", "foreground", ".2f"),
+    ("psnr_worst", "worst frame", ".2f"),
+    ("mb", "MB, float32", ".1f"),
+    ("fps", "frames/s", ".0f"),
+    ("seconds", "training, s", ".0f"),
+    ("steps", "steps", ",.0f"),
+    ("gaussians", "Gaussians", ",.0f"),
+)
+
+
+def spread_cell(values: Sequence[float | None], form: str) -> str:
+    """Format the mean of the values, and half their range if there are several."""
+    known = [value for value in values if value is not None]
+    if not known:
+        return ""
+    mean = format(fmean(known), form)
+    if len(known) == 1:
+        return mean
+    return f"{mean} ± {format((max(known) - min(known)) / 2, form)}"
+
+
+def group_rows(
+    found: Sequence[Mapping[str, Any]],
+) -> dict[tuple[str, str], list[Mapping[str, Any]]]:
+    """Return the rows of all seeds by capture and variant."""
+    groups: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
+    for row in found:
+        groups.setdefault((row["capture"], row["variant"]), []).append(row)
+    return groups
+
+
+def comparison_table(found: Sequence[Mapping[str, Any]]) -> str:
+    """Return a Markdown table of rows of benchmarks/dynamic.py, one per capture and variant."""
+    rows = [["capture", "variant", "seeds", *(heading for _, heading, _ in COMPARED)]]
+    refused = []
+    for (capture, variant), seeds in group_rows(found).items():
+        measured = [row for row in seeds if "refused" not in row]
+        if measured:
+            cells = [spread_cell([row[key] for row in measured], form) for key, _, form in COMPARED]
+            rows.append([capture, variant, str(len(measured)), *cells])
+        else:
+            refused.append(f"\nNot trained: {capture}, {variant}: {seeds[0]['refused']}\n")
+    loads = [row["load"] for row in found] or [0.0]
+    minutes = sorted({f"{row['minutes']:g}" for row in found})
+    return (
+        f"{table(rows)}\n\n"
+        f"{', '.join(minutes)} minutes of training on one thread; mean over seeds ± half the range.\n"
+        "What moves: pixels of motion masks, else of fixed cameras, the same for all variants; empty\n"
+        "without both. Foreground: where images have alpha. Load of the machine (1 minute average)\n"
+        f"during the trainings: {min(loads):.1f} to {max(loads):.1f}.\n{''.join(refused)}"
+    )
+
+
+SOURCES = {"code": "", "paper": "", "second": " (second hand)", "unverified": " (unverified)"}
+
+
+def own_figures(
+    system: Mapping[str, Any], results: Mapping[str, Result], moving: Sequence[Mapping[str, Any]]
+) -> tuple[list[str], list[str], list[str]]:
+    """Return figures, protocols and commits of the stored results of a system."""
+    figures = []
+    protocols = []
+    commits = []
+    for name in system.get("measurements", ()):
+        if name in results:
+            result = results[name]
+            figures.append(f"{Path(result.capture).name} {psnr_cell(result)}")
+            protocols.append(f"{result.image_size}, {result.steps:,} steps")
+            commits.append(result.commit)
+    for (capture, variant), seeds in group_rows(moving).items():
+        measured = [row for row in seeds if "refused" not in row]
+        if variant == system.get("variant") and measured:
+            figures.append(f"{capture} {spread_cell([row['psnr'] for row in measured], '.2f')}")
+            protocols.append(f"{measured[0]['minutes']:g} minutes, one thread")
+            commits += [row["commit"] for row in measured]
+    return figures, protocols, commits
+
+
+def systems_page(results: Mapping[str, Result]) -> str:
+    """The page with a row per system: published figure, own figure, command and commit."""
+    systems = yaml.safe_load(PUBLISHED.read_text(encoding="utf-8"))
+    moving = json.loads(MOVING.read_text(encoding="utf-8")) if MOVING.is_file() else []
+    head = ["system", "published", "data, protocol", "ours, PSNR in dB", "protocol", "differs"]
+    rows = [[*head, "commit"]]
+    commands = []
+    for system in systems:
+        title = f"{system['system']} ({system['paper']})"
+        if "arxiv" in system:
+            link = f"https://arxiv.org/abs/{system['arxiv']}"
+            title = f"[{system['system']}]({link}), {system['paper']}"
+        figures, protocols, commits = own_figures(system, results, moving)
+        rows.append(
+            [
+                title,
+                system["published"] + SOURCES[system["checked"]],
+                system["protocol"],
+                "; ".join(figures) or "not measured",
+                "; ".join(dict.fromkeys(protocols)),
+                system["differs"],
+                ", ".join(dict.fromkeys(commits)),
+            ]
+        )
+        commands.append(f"# {system['system']}")
+        for name in system.get("measurements", ()):
+            measurement = MEASUREMENTS[name]
+            place = Path(measurement.capture).name
+            words = ["dyngs", *training_command(measurement, place, f"runs/{name}", threads=1)]
+            commands.append(results[name].command if name in results else " ".join(words))
+        if "command" in system:
+            commands.append(system["command"])
+    text = (
+        "# Results beside published figures\n\n"
+        "Every system that dyngs trains, with the figure of its paper and ours. The data sets of the\n"
+        "papers are not always the same, so most rows do not compare directly: see *differs*.\n"
+        "*Second hand*: read in another paper or note. *Unverified*: not confirmed.\n"
+        "Captures: [benchmarks](benchmarks/index.md#captures).\n\n"
+        f"{table(rows)}\n\n## Commands\n\n"
+        "`dyngs eval RUN` then prints the figure. Networks for people first\n"
+        "[predict a person](guides/people.md#predict-from-a-few-images).\n\n"
+        "```bash\n" + "\n".join(commands) + "\n```\n"
+    )
+    if moving:
+        text += f"\n## Moving scenes at equal minutes\n\n{comparison_table(moving)}"
+    return text
+
+
 def written_pages(results: dict[str, Result]) -> dict[Path, str]:
     """Return the contents of all pages, and of README.md with its new table."""
     pages = {PAGES / f"{page}.md": quality_page(page, results) for page in DETAILS}
     pages[PAGES / "size.md"] = size_page(results)
+    pages[ROOT / "docs/results.md"] = systems_page(results)
     readme = ROOT / "README.md"
     before, rest = readme.read_text(encoding="utf-8").split(TABLE_BEGIN)
     after = rest.split(TABLE_END)[1]

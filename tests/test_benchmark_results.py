@@ -11,19 +11,15 @@ import pytest
 ROOT = Path(__file__).parents[1]
 
 
-def load_benchmark(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, ROOT / f"benchmarks/{name}.py")
+@pytest.fixture(scope="module")
+def results() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("results", ROOT / "benchmarks/results.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
+    sys.modules["results"] = module
     spec.loader.exec_module(module)
     return module
-
-
-@pytest.fixture(scope="module")
-def results() -> ModuleType:
-    return load_benchmark("results")
 
 
 def test_pages_and_readme_equal_stored_results(results: ModuleType) -> None:
@@ -49,17 +45,19 @@ def test_a_stored_command_is_that_of_its_measurement(results: ModuleType) -> Non
         assert stored["date"]
 
 
-@pytest.mark.usefixtures("results")
-def test_the_comparison_of_moving_systems_shows_means_spread_and_refusals(tmp_path: Path) -> None:
-    dynamic = load_benchmark("dynamic")
-    (tmp_path / "results").mkdir()
-    numbers = {key: 5 for key, _, _ in dynamic.COLUMNS} | {"psnr_moving": None}
-    for seed, psnr in enumerate((30.0, 31.0)):
-        facts = {"capture": "rig", "variant": "mlp", "seed": seed, "load": 1.0, **numbers}
-        path = tmp_path / "results" / f"rig_mlp_{seed}.json"
-        dynamic.write_result(path, facts | {"psnr": psnr})
-    refused = {"capture": "flag", "variant": "free", "seed": 0, "load": 2.0, "refused": "no times"}
-    dynamic.write_result(tmp_path / "results" / "flag_free_0.json", refused)
-    text = dynamic.results_table(dynamic.load_results(tmp_path))
+def test_a_comparison_shows_means_spread_and_refusals(results: ModuleType) -> None:
+    numbers = {key: 5 for key, _, _ in results.COMPARED} | {"psnr_moving": None}
+    about = {"capture": "rig", "variant": "mlp", "minutes": 1.5, "load": 1.0}
+    rows = [about | numbers | {"seed": seed, "psnr": 30.0 + seed} for seed in range(2)]
+    rows.append(about | {"variant": "free", "refused": "no times"})
+    text = results.comparison_table(rows)
     assert "| rig | mlp | 2 | 30.50 ± 0.50 |  | 5.00 ± 0.00 |" in text
-    assert "Not trained: flag, free: no times" in text
+    assert "Not trained: rig, free: no times" in text
+
+
+def test_a_row_for_each_published_system(results: ModuleType) -> None:
+    page = results.systems_page({})
+    assert page.count("| not measured |") == 18
+    assert "36.39 dB" in page
+    stored = results.systems_page(results.load_results())
+    assert "lego400 35.64" in stored

@@ -15,7 +15,10 @@ def test_known_rows() -> None:
         ("train.ssim_weight",): ("a number >= 0 and <= 1", "0.2"),
         ("data.longest_side",): ("an integer >= 0 or null", "1600"),
         ("strategy.max_gaussians", "mcmc"): ("an integer >= 1", "300000"),
-        ("model.deform.kind", "dynamic"): ("one of hexplane, mlp, control_nodes, free", "hexplane"),
+        ("model.deform.kind", "dynamic"): (
+            "one of hexplane, mlp, control_nodes, free, gaussians_4d",
+            "hexplane",
+        ),
     }
     for key, found in expected.items():
         assert (rows[key].allowed, rows[key].default) == found, key
