@@ -8,9 +8,8 @@ harmonics times a cosine series in time. Slicing is one operation of the kernels
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -38,17 +37,6 @@ LR_QUATS = 1e-3  # learning rate of the right quaternions, that of 3DGS for rota
 LR_SH = 0.0025 / 20  # learning rate of SH coefficients over time, that of 3DGS above degree 0
 LR_DECAY = 0.1  # ratio of the last to the first learning rate
 MIN_SPAN = 0.25  # smallest standard deviation along time, in time steps
-
-
-class _Shape(NamedTuple):
-    """Parameters of A Gaussians that the predictor multiplies, in the order of its outputs."""
-
-    means: Tensor  # (A, 3)
-    times: Tensor  # (A, 1)
-    log_scales: Tensor  # (A, 3)
-    log_spans: Tensor  # (A, 1)
-    quats: Tensor  # (A, 4)
-    right_quats: Tensor  # (A, 4)
 
 
 class Gaussians4D(DeformationField):
@@ -110,15 +98,17 @@ class Gaussians4D(DeformationField):
             select_rows(self.parameters[name], moving.visible)
             for name in ("times", "log_spans", "right_quats")
         )
-        shape = _Shape(own.means, times, own.log_scales, log_spans, own.quats, right_quats)
-        shape = self._deformed(shape, time, eye) if self.depends_on_view else shape
+        shapes = own.means, times, own.log_scales, log_spans, own.quats, right_quats
+        if self.depends_on_view:
+            shapes = self._deformed(shapes, own.means.new_full((1, 1), time), eye)
+        means, mean_times, log_scales, log_spans, quats, right_quats = shapes
         sliced = slice_gaussians(
-            shape.means,
-            shape.times[:, 0],
-            shape.quats,
-            shape.right_quats,
-            shape.log_scales,
-            shape.log_spans[:, 0],
+            means,
+            mean_times[:, 0],
+            quats,
+            right_quats,
+            log_scales,
+            log_spans[:, 0],
             own.logit_opacities,
             time,
         )
@@ -130,32 +120,34 @@ class Gaussians4D(DeformationField):
             tensors[name] = tensors[name].index_copy(0, moving.rows, values)
         return DeformedGaussians(Gaussians(**tensors))
 
-    def _deformed(self, shape: _Shape, time: float, eye: Tensor | None) -> _Shape:
-        """Return the Gaussians as the predictor deforms them at ``time``, seen from ``eye`` (3,).
+    def _deformed(
+        self, shapes: Sequence[Tensor], now: Tensor, eye: Tensor | None
+    ) -> Sequence[Tensor]:
+        """Return ``shapes`` as the predictor deforms them at ``now``, seen from ``eye`` (3,).
 
         Means are multiplied about the centre of the motion and the middle of the clip. A scale is
         multiplied by exp(c) instead of 1 + c and so stays positive.
+
+        Args:
+            shapes: means, their times, log scales, log spans, left and right rotations.
+            now: (1, 1), or (A, 1) with a time for each Gaussian.
         """
-        means = shape.means.detach()
+        means, times, _, _, quats, right_quats = shapes
         directions = None
         if eye is not None:
-            directions = torch.nn.functional.normalize(means - eye.detach().to(means), dim=1)
+            away = means.detach() - eye.detach().to(means)
+            directions = torch.nn.functional.normalize(away, dim=1)
         changes = predictor.predict_changes(
             self.parameters,
-            self.setup.normalize(means),
-            shape.times.detach(),
+            self.setup.normalize(means.detach()),
+            times.detach(),
             directions,
-            means.new_full((1, 1), time),
+            now,
         )
-        parts = _Shape(*changes.split([x.shape[1] for x in shape], dim=1))
-        return _Shape(
-            shape.means + (shape.means - self.setup.center) * parts.means,
-            shape.times + (shape.times - 0.5) * parts.times,
-            shape.log_scales + parts.log_scales,
-            shape.log_spans + parts.log_spans,
-            shape.quats + shape.quats * parts.quats,
-            shape.right_quats + shape.right_quats * parts.right_quats,
-        )
+        factors = means - self.setup.center, times - 0.5, 1, 1, quats, right_quats
+        sizes = [x.shape[1] for x in shapes]
+        parts = zip(shapes, factors, changes.split(sizes, dim=1), strict=True)
+        return [x + factor * change for x, factor, change in parts]
 
     def _colours(self, sh: Tensor, elapsed: Tensor, visible: Tensor | None) -> Tensor:
         """Return SH coefficients (A, K, 3), ``elapsed`` (A, 1) clips after the mean times."""

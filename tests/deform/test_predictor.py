@@ -108,6 +108,12 @@ def scene_of(field: Gaussians4D) -> DynamicScene:
     return DynamicScene(gaussians=cloud(), training_times=times, field=field, moving=moving)
 
 
+def seen_from(scene: DynamicScene, eye: Tensor) -> Gaussians:
+    now = scene.time_step(0.4)
+    assert now.from_eye is not None
+    return now.from_eye(eye)
+
+
 def test_each_view_of_a_scene_has_its_own_gaussians() -> None:
     """Views of one call equal single ones, also from a time step; ``at`` is the view without a
     camera."""
@@ -120,10 +126,10 @@ def test_each_view_of_a_scene_has_its_own_gaussians() -> None:
             view = cameras.select(i)
             assert torch.equal(scene.render(view, now).rgb[0], both[i])
             assert_same(
-                now.from_eye(view.centers[0]), at(trained_field(), cloud(), view.centers[0])
+                seen_from(scene, view.centers[0]), at(trained_field(), cloud(), view.centers[0])
             )
         assert_same(scene.at(0.4), at(trained_field(), cloud(), None))
-    first, second = (now.from_eye(center).means for center in cameras.centers)
+    first, second = (seen_from(scene, center).means for center in cameras.centers)
     assert float((first - second).abs().max()) > 1e-3
 
 
@@ -131,8 +137,8 @@ def test_masked_gaussians_do_not_reach_the_predictor() -> None:
     scene = scene_of(trained_field())
     seen = torch.rand(3, COUNT, generator=torch.Generator().manual_seed(1)) < 0.4
     masked = replace(scene, masks=VisibilityMasks.pack((0.0, 0.5, 1.0), seen))
-    found = masked.time_step(0.3).from_eye(EYE)
-    assert_same(found, scene.time_step(0.3).from_eye(EYE).select(seen[:2].any(0)))
+    found = seen_from(masked, EYE)
+    assert_same(found, seen_from(scene, EYE).select(seen[:2].any(0)))
 
 
 def test_gradients_stop_at_the_inputs_of_the_network() -> None:
