@@ -3,13 +3,18 @@
     python benchmarks/dynamic.py FOLDER --data CAPTURES [--jobs 2] [--minutes 1.5] [--seeds 0 1]
     python benchmarks/dynamic.py FOLDER --speeds
     python benchmarks/dynamic.py FOLDER --table [--store]
+    python benchmarks/dynamic.py FOLDER --films [--captures rig stage]
 
 One row per variant, capture and seed is stored as FOLDER/results/CAPTURE_VARIANT_SEED.json; stored
 rows are not trained again. `--captures` takes names of CAPTURES (in the folder of --data) or
-NAME=PATH[,KEY=VALUE...], `--variants` names of VARIANTS or NAME=PRESET[,KEY=VALUE...]. Videos get
-poses once, by `dyngs data sfm`. `--speeds` times the models of each capture alternately, which
-`--jobs` does not disturb; run it when the machine has nothing else to do. `--store` keeps the rows
-for docs/results.md, which `python benchmarks/results.py write` writes.
+NAME=PATH[,KEY=VALUE...], `--variants` names of VARIANTS and PUBLISHED or
+NAME=PRESET[,KEY=VALUE...]. Videos get poses once, by `dyngs data sfm`. `--speeds` times the models
+of each capture alternately, which `--jobs` does not disturb; run it when the machine has nothing
+else to do. `--store` keeps the rows for docs/results.md, which `python benchmarks/results.py
+write` writes.
+
+`--films` writes FOLDER/films/CAPTURE_VARIANT.mp4 for the first seed: the camera of the first held-out
+view over time, truth left, rendering right; a bar below marks frames that were held out.
 
 What moves is scored on the same pixels for all variants: motion masks of the capture, else pixels
 of fixed cameras that differ from their median over time. One moving camera without masks has none.
@@ -23,7 +28,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import date
@@ -32,7 +37,19 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+import torch
 from results import MOVING, comparison_table, current_commit, processor
+
+from dyngs.data.loader import ImageLoader
+from dyngs.data.times import evenly_spaced, static_cameras
+from dyngs.evaluate.report import load_split_images
+from dyngs.evaluate.view_scores import SceneRenderer, time_renders
+from dyngs.export.video import video_writer
+from dyngs.models.checkpoint import read_run_capture
+from dyngs.models.views import evaluation_background
+from dyngs.ops.native import kernel_threads
+from dyngs.runs.checkpoint import load_run
+from dyngs.runs.opened import scene_of_split, split_views
 
 # Overrides of each capture; a folder or video of this path in the folder of --data
 CAPTURES: dict[str, tuple[str, tuple[str, ...]]] = {
@@ -58,6 +75,17 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "gaussians_4d_all": dynamic("gaussians_4d", "model.select_moving=false"),
     "hexplane": dynamic("hexplane"),
     "mlp": dynamic("mlp"),
+}
+# Published protocols, and single differences between them and the preset; only on request
+PUBLISHED: dict[str, tuple[str, ...]] = {
+    "4dgs": ("4dgs",),
+    "4dgs_detached": ("4dgs", "model.deform.position_gradient=false"),
+    "4dgs_selected": ("4dgs", "model.select_moving=true"),
+    "hexplane_attached": dynamic("hexplane", "model.deform.position_gradient=true"),
+    "hexplane_all": dynamic("hexplane", "model.select_moving=false"),
+    "deformable_3dgs": ("deformable_3dgs",),
+    "deformable_3dgs_small": ("deformable_3dgs", "init.num_random=5000"),
+    "mlp_all": dynamic("mlp", "model.select_moving=false"),
 }
 
 
@@ -194,39 +222,83 @@ def load_results(folder: Path) -> list[dict[str, Any]]:
     )
 
 
-def time_models(folder: Path, threads: int) -> None:
-    """Time the models of the first seed of each capture alternately, and store frames a second."""
-    from dyngs.api.load import read_capture
-    from dyngs.data.loader import ImageLoader
-    from dyngs.data.times import evenly_spaced
-    from dyngs.evaluate.view_scores import SceneRenderer, time_renders
-    from dyngs.models.views import evaluation_background
-    from dyngs.ops.native import kernel_threads
-    from dyngs.runs.checkpoint import load_run
-    from dyngs.runs.opened import scene_of_split, split_views
+def run_of(folder: Path, result: Mapping[str, Any]) -> Path:
+    """Return the run folder of a result."""
+    name = f"{result['capture']}_{result['variant']}_{result['seed']}"
+    return next((folder / "comparisons" / name / "runs").iterdir())
 
+
+def time_models(folder: Path, captures: Sequence[str]) -> None:
+    """Time the models of each capture alternately, and store their frames per second."""
     found = [result for result in load_results(folder) if "refused" not in result]
-    for capture_name in dict.fromkeys(result["capture"] for result in found):
-        chosen = [result for result in found if result["capture"] == capture_name]
-        stems = [f"{x['capture']}_{x['variant']}_{x['seed']}" for x in chosen]
-        runs = [
-            load_run(next((folder / "comparisons" / stem / "runs").iterdir())) for stem in stems
-        ]
-        data = runs[0].config.data
-        capture = read_capture(data)
-        loader = ImageLoader(split_views(capture, "test"), data)
+    for capture in captures:
+        chosen = [result for result in found if result["capture"] == capture]
+        opened = [open_model(run_of(folder, result)) for result in chosen]
+        if not opened:
+            continue
+        loader = opened[0].held_out
         images = [loader[i] for i in evenly_spaced(len(loader), 4)]
-        _, background = evaluation_background(data.background, capture.has_alpha)
-        drawings = []
-        for run in runs:
-            scene = scene_of_split(run, capture, "test")
-            drawings.append(SceneRenderer(scene, scene.options, background))
-        with kernel_threads(threads):
-            seconds = time_renders(drawings, images, rounds=5)
-        for result, stem, own in zip(chosen, stems, seconds, strict=True):
+        with kernel_threads(1):
+            seconds = time_renders([model.renderer for model in opened], images, rounds=5)
+        for result, own in zip(chosen, seconds, strict=True):
+            name = f"{capture}_{result['variant']}_{result['seed']}"
             result["fps"] = 1 / median(own.tolist())
-            write_result(folder / "results" / f"{stem}.json", result)
-            print(f"{stem}: {result['fps']:.0f} frames/s", flush=True)
+            write_result(folder / "results" / f"{name}.json", result)
+            print(f"{name}: {result['fps']:.0f} frames/s", flush=True)
+
+
+@dataclass(frozen=True)
+class OpenedModel:
+    """A trained model with its images."""
+
+    renderer: SceneRenderer
+    images: ImageLoader  # of all splits
+    held_out: ImageLoader
+
+
+def open_model(run_dir: Path) -> OpenedModel:
+    """Return the renderer of a run, and its images with the cameras that training refined."""
+    run = load_run(run_dir)
+    capture = read_run_capture(run.config.data, run.info)
+    held_out = split_views(capture, "test")
+    views = [view for split in capture.splits.values() for view in split]
+    _, background = evaluation_background(run.config.data.background, capture.has_alpha)
+    scene = scene_of_split(run, capture, "test")
+    return OpenedModel(
+        SceneRenderer(scene, scene.options, background),
+        load_split_images(capture, views, run_dir, run),
+        load_split_images(capture, held_out, run_dir, run),
+    )
+
+
+def write_films(folder: Path, captures: Sequence[str]) -> None:
+    """Write a film of each model of the first seed, beside the true images."""
+    done = set[tuple[str, str]]()
+    for result in load_results(folder):
+        capture = result["capture"]
+        about = (capture, result["variant"])
+        if capture not in captures or "refused" in result or about in done:
+            continue
+        done.add(about)
+        model = open_model(run_of(folder, result))
+        views = model.images.views
+        held_out = {view.name for view in model.held_out.views}
+        first = next(i for i, view in enumerate(views) if view.name in held_out)
+        cameras = [indices for indices in static_cameras(views) if first in indices]
+        # One moving camera: its held-out frames
+        shown = cameras[0] if cameras else [i for i, v in enumerate(views) if v.name in held_out]
+        path = folder / "films" / f"{capture}_{result['variant']}.mp4"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with video_writer(path, fps=10) as add:
+            for i in sorted(shown, key=lambda i: views[i].time or 0.0):
+                image = model.images[i]
+                truth = image.composite(model.renderer.background)
+                rendered = model.renderer.image(image.cameras, image.time)
+                frame = torch.cat([truth, rendered], dim=1)
+                bar = torch.full((6, frame.shape[1], 3), float(views[i].name in held_out))
+                frame = torch.cat([frame, bar]).clamp(0, 1)
+                add((255 * frame).round().byte().numpy())
+        print(f"{path}: {len(shown)} frames, {len(held_out)} views held out in all", flush=True)
 
 
 def parse_named(word: str, known: dict[str, tuple[str, ...]]) -> tuple[str, tuple[str, ...]]:
@@ -251,6 +323,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=1.5, help="of each training")
     parser.add_argument("--jobs", type=int, default=1, help="trainings at a time, one thread each")
     parser.add_argument("--speeds", action="store_true", help="time stored models, do not train")
+    parser.add_argument("--films", action="store_true", help="write films of stored models")
     parser.add_argument("--table", action="store_true", help="print the table, do not train")
     parser.add_argument("--store", action="store_true", help="with --table: for docs/results.md")
     options = parser.parse_args()
@@ -260,12 +333,16 @@ def main() -> None:
         if options.store:
             write_result(MOVING, rows)
         return
-    if options.speeds:
-        time_models(options.folder, threads=1)
+    names = [word.partition("=")[0] for word in options.captures]
+    if options.speeds or options.films:
+        if options.speeds:
+            time_models(options.folder, names)
+        if options.films:
+            write_films(options.folder, names)
         return
     known = {name: (str(options.data / path), *words) for name, (path, words) in CAPTURES.items()}
     captures = dict(parse_named(word, known) for word in options.captures)
-    variants = dict(parse_named(word, VARIANTS) for word in options.variants)
+    variants = dict(parse_named(word, VARIANTS | PUBLISHED) for word in options.variants)
     folder = options.folder.absolute()
     rows = []
     for seed in options.seeds:

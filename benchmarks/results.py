@@ -116,6 +116,7 @@ MEASUREMENTS = {
         "systems", "orbits", "orbits", "dynamic",
         ("model.pilot_runs=false", "model.deform.kind=mlp"),
     ),
+    "orbits_gaussians_4d": Measurement("systems", "orbits", "orbits", "gaussians_4d"),
     "stage_free": Measurement(
         "systems", "stage", "stage", "dynamic",
         ("model.pilot_runs=false", "model.deform.kind=free", "train.steps=10000"),

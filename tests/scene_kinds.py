@@ -35,7 +35,7 @@ PERSON = HumanModel(sh_degree=0)
 def scene_of_kind(kind: str) -> GaussianScene:
     """Nine Gaussians with a 3D filter, of which four may move, or a person; ``masked`` is a
     hexplane with masks, ``windowed`` are nodes of which each Gaussian is there for a part of the
-    clip."""
+    clip. 4D Gaussians have spherical harmonics, others a colour network."""
     std = 0.01 + torch.arange(9.0) / 100
     if kind == "static":
         return StaticScene(gaussians=cloud(), filter_std=std, training_times=SEEN_AT)
@@ -56,7 +56,7 @@ def scene_of_kind(kind: str) -> GaussianScene:
         moving=MOVING,
         filter_std=std,
         masks=masks,
-        colour=_network(),
+        colour=None if kind == "gaussians_4d" else _network(),
     )
 
 

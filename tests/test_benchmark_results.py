@@ -8,18 +8,25 @@ from types import ModuleType
 
 import pytest
 
+from dyngs.config.io import load_config
+from dyngs.deform.keys import DynamicModel
+
 ROOT = Path(__file__).parents[1]
+
+
+def load_benchmark(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, ROOT / f"benchmarks/{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return module
 
 
 @pytest.fixture(scope="module")
 def results() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("results", ROOT / "benchmarks/results.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["results"] = module
-    spec.loader.exec_module(module)
-    return module
+    return load_benchmark("results")
 
 
 def test_pages_and_readme_equal_stored_results(results: ModuleType) -> None:
@@ -61,3 +68,11 @@ def test_a_row_for_each_published_system(results: ModuleType) -> None:
     assert "36.39 dB" in page
     stored = results.systems_page(results.load_results())
     assert "lego400 35.64" in stored
+
+
+@pytest.mark.usefixtures("results")
+def test_every_compared_variant_is_a_valid_configuration() -> None:
+    for name, (preset, *overrides) in load_benchmark("dynamic").VARIANTS.items():
+        config = load_config(preset, ["data.root=capture", *overrides])
+        assert isinstance(config.model, DynamicModel)
+        assert name.startswith(config.model.deform.kind)

@@ -11,13 +11,14 @@ from torch import Tensor
 from dyngs.config import Config, DataConfig, DefaultStrategy, RandomInit, RunConfig, TrainConfig
 from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
 from dyngs.deform.control_nodes import Nodes, blend_node_motion
-from dyngs.deform.field import DeformationField, FieldSetup, Offsets, innermost
+from dyngs.deform.field import DeformationField, FieldSetup, MovingRows, Offsets, innermost
 from dyngs.deform.fields import create_field
 from dyngs.deform.keys import (
     ControlNodesField,
     DeformField,
     DynamicModel,
     FreeField,
+    Gaussians4DField,
     HexplaneField,
     MlpField,
 )
@@ -25,7 +26,7 @@ from dyngs.gaussians import Gaussians
 from dyngs.ops.quaternions import identity_quat
 
 KINDS = ("hexplane", "mlp", "control_nodes")  # fields that begin as the identity
-ALL_KINDS = (*KINDS, "free")
+ALL_KINDS = (*KINDS, "free", "gaussians_4d")
 HEADS = ("rotations", "scales", "opacities", "colors")
 TIMES = (0.0, 0.37, 1.0)
 
@@ -39,12 +40,14 @@ def tiny_options(kind: str, *, everything: bool = True) -> DeformField:
         return ControlNodesField(nodes=5, pieces=3, moves=moves)
     if kind == "free":
         return FreeField()
+    if kind == "gaussians_4d":
+        return Gaussians4DField()
     return MlpField(depth=2, width=8, moves=moves)
 
 
 def tiny_setup(num_moving: int = 9, num_times: int = 10) -> FieldSetup:
-    """A box of half side 2 around the origin."""
-    return FieldSetup(torch.zeros(3), torch.full((3,), 2.0), num_times, num_moving, 1.5)
+    """A box of half side 2 around the origin, with Gaussians of SH degree 1."""
+    return FieldSetup(torch.zeros(3), torch.full((3,), 2.0), num_times, num_moving, 1.5, 4)
 
 
 def tiny_field(kind: str, num_moving: int = 9, *, everything: bool = True) -> DeformationField:
@@ -64,9 +67,17 @@ def stirred_field(
     Control nodes lie among the first means of ``cloud``.
     """
     field = tiny_field(kind, num_moving, everything=everything)
-    field.offsets(cloud(num_moving).means, 0.0)
+    moved(field, cloud(num_moving), 0.0)
     stir(field, size)
     return field
+
+
+def moved(
+    field: DeformationField, gaussians: Gaussians, time: float, rows: Tensor | None = None
+) -> Gaussians:
+    """The Gaussians at a time: a field moves their ``rows``, or all."""
+    means = gaussians.means if rows is None else gaussians.means[rows]
+    return field.deform(gaussians, MovingRows(means, None, rows), time).gaussians
 
 
 def followed(nodes: Nodes, means: Tensor, at_nodes: Offsets) -> Offsets:
@@ -110,6 +121,7 @@ def busy_config(capture: Path, run_dir: Path, kind: str, **model: object) -> Con
         "mlp": {"lr": 1e-2},
         "control_nodes": {"lr_means": 1e-2},
         "free": {},
+        "gaussians_4d": {"time_grad_threshold": 1e-8},
     }
     field = tiny_options(kind).model_copy(update=rates[kind])
     freeze_below_px = {"control_nodes": 1.5, "free": 0.05}.get(kind, 0.6)
@@ -132,7 +144,12 @@ def busy_config(capture: Path, run_dir: Path, kind: str, **model: object) -> Con
         model=DynamicModel.model_validate(options),
         init=RandomInit(num_random=60),
         strategy=DefaultStrategy(
-            start=1, stop=30_000, every=3, grad_threshold=1e-6, reset_every=5, max_gaussians=300
+            start=1,
+            stop=30_000,
+            every=3,
+            grad_threshold=1e-6,
+            reset_every=5,
+            max_gaussians=500 if kind == "gaussians_4d" else 300,
         ),
         train=TrainConfig(steps=24, log_every=1),
         run=RunConfig(dir=run_dir, threads=1),

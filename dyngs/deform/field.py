@@ -319,7 +319,10 @@ def select_rows(x: Tensor, rows: Tensor | None) -> Tensor:
 
 
 class Decoder:
-    """A multilayer perceptron with a zero last layer; layer ``skip`` gets the features again."""
+    """A multilayer perceptron with a zero last layer; layer ``skip`` gets the features again.
+
+    With ``separate_heads`` each head reads only its own part of the last hidden layer.
+    """
 
     def __init__(
         self,
@@ -328,9 +331,12 @@ class Decoder:
         options: FieldSection,
         *,
         skip: int | None = None,
+        separate_heads: bool = False,
     ) -> None:
-        self.widths = [num_inputs, *hidden, sum(head_sizes(options).values())]
+        heads = list(head_sizes(options).values())
+        self.widths = [num_inputs, *hidden, sum(heads)]
         self.skip = skip
+        self.separate_heads = heads if separate_heads else []
 
     def start_values(self, generator: torch.Generator) -> dict[str, Tensor]:
         """Return Glorot weights (Glorot and Bengio 2010), zero biases and a zero last layer."""
@@ -338,6 +344,8 @@ class Decoder:
         last = len(self.widths) - 2
         for i in range(last + 1):
             fan_in = self.widths[i] + (self.widths[0] if i == self.skip else 0)
+            if i == last and self.separate_heads:
+                fan_in //= len(self.separate_heads)
             fan_out = self.widths[i + 1]
             weight = glorot(fan_in, fan_out, generator)
             values[f"weight{i}"] = torch.zeros_like(weight) if i == last else weight
@@ -349,6 +357,10 @@ class Decoder:
             Layer(parameters[f"weight{i}"], parameters[f"bias{i}"])
             for i in range(len(self.widths) - 1)
         ]
+        if self.separate_heads:
+            *others, last = layers
+            weight = torch.block_diag(*last.weight.split(self.separate_heads))
+            layers = [*others, Layer(weight, last.bias)]
         return perceptron(features, layers, skip=self.skip)
 
 

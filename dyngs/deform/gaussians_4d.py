@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -31,12 +31,23 @@ from dyngs.gaussians.densify import SPLIT_SHRINK
 from dyngs.gaussians.optimizer import Parameters
 from dyngs.ops.adam import Count
 from dyngs.ops.quaternions import identity_quat, quat_product, unit_quats
-from dyngs.ops.slicing import slice_gaussians
+from dyngs.ops.slicing import condition_gaussians, slice_gaussians
 
 LR_QUATS = 1e-3  # learning rate of the right quaternions, that of 3DGS for rotations
 LR_SH = 0.0025 / 20  # learning rate of SH coefficients over time, that of 3DGS above degree 0
 LR_DECAY = 0.1  # ratio of the last to the first learning rate
 MIN_SPAN = 0.25  # smallest standard deviation along time, in time steps
+MIN_WEIGHT = 0.05  # Gaussians are not rendered where their opacity is below this fraction
+
+
+@dataclass(frozen=True)
+class LinearGaussians:
+    """M 4D Gaussians as 3D Gaussians that move along lines and fade."""
+
+    gaussians: Gaussians  # at their mean times; the covariances are constant
+    velocities: Tensor  # (M, 3) world units per clip
+    times: Tensor  # (M,) mean times, in clips
+    log_stds: Tensor  # (M,) logarithms of the standard deviations of the opacity over time
 
 
 class Gaussians4D(DeformationField):
@@ -94,60 +105,78 @@ class Gaussians4D(DeformationField):
         eye: Tensor | None = None,
     ) -> DeformedGaussians:
         own = gaussians if moving.rows is None else gaussians.picked(moving.rows)
-        times, log_spans, right_quats = (
-            select_rows(self.parameters[name], moving.visible)
-            for name in ("times", "log_spans", "right_quats")
+        now = own.means.new_full((1, 1), time)
+        means, times, log_scales, log_spans, quats, right_quats = self._shapes(
+            own, moving.visible, now, eye
         )
-        shapes = own.means, times, own.log_scales, log_spans, own.quats, right_quats
-        if self.depends_on_view:
-            shapes = self._deformed(shapes, own.means.new_full((1, 1), time), eye)
-        means, mean_times, log_scales, log_spans, quats, right_quats = shapes
         sliced = slice_gaussians(
             means,
-            mean_times[:, 0],
+            times[:, 0],
             quats,
             right_quats,
             log_scales,
             log_spans[:, 0],
             own.logit_opacities,
             time,
+            MIN_WEIGHT,
         )
-        now = Gaussians(*sliced, self._colours(own.sh, time - times, moving.visible))
+        drawn = Gaussians(*sliced, self._colours(own.sh, time - times, moving.visible))
         if moving.rows is None:
-            return DeformedGaussians(now)
+            return DeformedGaussians(drawn)
         tensors = gaussians.tensors()
-        for name, values in now.tensors().items():
+        for name, values in drawn.tensors().items():
             tensors[name] = tensors[name].index_copy(0, moving.rows, values)
         return DeformedGaussians(Gaussians(**tensors))
 
-    def _deformed(
-        self, shapes: Sequence[Tensor], now: Tensor, eye: Tensor | None
+    def _shapes(
+        self, gaussians: Gaussians, visible: Tensor | None, now: Tensor, eye: Tensor | None
     ) -> Sequence[Tensor]:
-        """Return ``shapes`` as the predictor deforms them at ``now``, seen from ``eye`` (3,).
+        """Return means, their times, log scales, log spans, and left and right rotations.
 
-        Means are multiplied about the centre of the motion and the middle of the clip. A scale is
-        multiplied by exp(c) instead of 1 + c and so stays positive.
+        The predictor multiplies means about the centre of the motion and the middle of the clip. It
+        multiplies a scale by exp(c) instead of 1 + c, which stays positive.
 
         Args:
-            shapes: means, their times, log scales, log spans, left and right rotations.
+            gaussians: A canonical Gaussians.
+            visible: their indices (A,) among the moving ones; None: all.
             now: (1, 1), or (A, 1) with a time for each Gaussian.
+            eye: (3,) camera centre; None: no camera.
         """
-        means, times, _, _, quats, right_quats = shapes
+        times, log_spans, right_quats = (
+            select_rows(self.parameters[name], visible)
+            for name in ("times", "log_spans", "right_quats")
+        )
+        means = gaussians.means
+        quats = gaussians.quats
+        shapes = means, times, gaussians.log_scales, log_spans, quats, right_quats
+        if not self.depends_on_view:
+            return shapes
         directions = None
         if eye is not None:
             away = means.detach() - eye.detach().to(means)
             directions = torch.nn.functional.normalize(away, dim=1)
+        inside = self.setup.normalize(means.detach())
         changes = predictor.predict_changes(
-            self.parameters,
-            self.setup.normalize(means.detach()),
-            times.detach(),
-            directions,
-            now,
+            self.parameters, inside, times.detach(), directions, now
         )
         factors = means - self.setup.center, times - 0.5, 1, 1, quats, right_quats
-        sizes = [x.shape[1] for x in shapes]
-        parts = zip(shapes, factors, changes.split(sizes, dim=1), strict=True)
+        parts = zip(shapes, factors, changes.split([3, 1, 3, 1, 4, 4], dim=1), strict=True)
         return [x + factor * change for x, factor, change in parts]
+
+    @torch.no_grad()
+    def linear(self, gaussians: Gaussians) -> LinearGaussians:
+        """Return the motion and the conditional covariances of the canonical ``gaussians`` (M).
+
+        With a predictor, each as it is at its mean time, without a camera.
+        """
+        means, times, log_scales, log_spans, quats, right_quats = self._shapes(
+            gaussians, None, self.parameters["times"], None
+        )
+        quats, log_scales, velocities, log_stds = condition_gaussians(
+            quats, right_quats, log_scales, log_spans[:, 0]
+        )
+        conditioned = gaussians.replace(means=means, quats=quats, log_scales=log_scales)
+        return LinearGaussians(conditioned, velocities, times[:, 0], log_stds)
 
     def _colours(self, sh: Tensor, elapsed: Tensor, visible: Tensor | None) -> Tensor:
         """Return SH coefficients (A, K, 3), ``elapsed`` (A, 1) clips after the mean times."""
@@ -158,6 +187,25 @@ class Gaussians4D(DeformationField):
             phase = (2 * math.pi * order) * elapsed[:, :, None]
             sh = torch.addcmul(sh, phase.cos(), amplitude)
         return sh
+
+    @torch.no_grad()
+    def storage_quats(self, quats: Tensor) -> tuple[Tensor, Tensor]:
+        """Return equivalent left and right rotations (M, 4) with the largest part of q_l first.
+
+        Storage turns other Gaussians by halves, which changes q_l v q_r. But q_l u v conj(u) q_r is
+        the same Gaussian for each unit u of the quaternions.
+        """
+        left = unit_quats(quats)
+        right = unit_quats(self.parameters["right_quats"])
+        units = torch.eye(4, device=quats.device)[left.abs().argmax(1)]
+        forms = quat_product(left, units), quat_product(units, right)
+        left, right = (torch.where(x[:, :1] < 0, -x, x) for x in forms)
+        return left, right
+
+    @property
+    def num_waves(self) -> int:
+        """Number of cosines in time of each spherical harmonic."""
+        return self.options.frequencies if "sh_time" in self.parameters else 0
 
     @property
     def time_gradient(self) -> Tensor:

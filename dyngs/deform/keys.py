@@ -57,11 +57,31 @@ class HexplaneField(FieldSection):
     )
     width: int = Field(default=64, ge=1, description="neurons per hidden layer of the decoder")
     depth: int = Field(default=1, ge=1, description="hidden layers of the decoder before the heads")
+    separate_heads: bool = Field(
+        default=False,
+        description="whether each attribute reads its own hidden units only, as in 4DGS",
+    )
+    times_per_row: Positive = Field(
+        default=2, description="training times per row of the time planes; 4DGS: 4"
+    )
+    position_gradient: bool = Field(
+        default=False,
+        description="whether positions also receive the gradient through the planes, as in 4DGS",
+    )
+    penalty_weights: tuple[float, float, float] = Field(
+        default=(1e-4, 0.01, 1e-4),
+        description="weights of the smoothness of space planes, smoothness along time, and "
+        "sparsity of time planes; 4DGS: 2e-4, 1e-3, 1e-4 for real captures",
+    )
     lr_planes: Positive = Field(
         default=1.6e-3, description="learning rate of the planes, times the scene extent"
     )
     lr_decoder: Positive = Field(
         default=1.6e-4, description="learning rate of the decoder, times the scene extent"
+    )
+    lr_decay: Positive = Field(
+        default=0.01,
+        description="ratio of the last to the first learning rate; 4DGS: 0.1 for real captures",
     )
 
 
@@ -74,6 +94,23 @@ class MlpField(FieldSection):
     )
     depth: int = Field(default=8, ge=2, description="hidden layers")
     width: int = Field(default=256, ge=1, description="neurons per hidden layer")
+    time_frequencies: int = Field(
+        default=6,
+        ge=1,
+        description="octaves of the encoding of time; Deformable-3DGS: 10 for real captures",
+    )
+    time_features: int = Field(
+        default=0,
+        ge=0,
+        description="outputs of a network for time, whose outputs the MLP reads; 0: none; "
+        "Deformable-3DGS: 30 for synthetic captures",
+    )
+    time_noise: float = Field(
+        default=0,
+        ge=0,
+        description="standard deviation of the noise of training times, in frame intervals, at the "
+        "start; it falls to 0 in half of the run; Deformable-3DGS: 0.1 for real captures",
+    )
     lr: Positive = Field(default=8e-4, description="learning rate")
 
 
@@ -175,6 +212,11 @@ class DynamicModel(SceneModel):
         description="fraction of the run after which motion is trained; before, a static model is trained on all views "
         "(coarse stage of 4DGS), for at least 1000 steps or a third of the run",
     )
+    static_decay: bool = Field(
+        default=True,
+        description="whether the learning rate of positions also decays while the model is static; "
+        "4DGS: false",
+    )
     motion_threshold: float = Field(
         default=0.04,
         ge=0,
@@ -182,8 +224,8 @@ class DynamicModel(SceneModel):
     )
     select_moving: bool = Field(
         default=True,
-        description="whether only Gaussians that the static model renders badly enter the field; false: all, as in "
-        "4DGS and Deformable-3DGS",
+        description="whether only Gaussians that the static model renders badly enter the field; "
+        "false: all, and no rigid bodies are searched, as in 4DGS and Deformable-3DGS",
     )
     num_random_moving: int = Field(
         default=4000,

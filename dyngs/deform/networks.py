@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import torch
 from torch import Tensor
 
+from dyngs.core.initialisation import glorot
 from dyngs.deform.field import (
     MAX_KEY_TIMES,
     Decoder,
@@ -19,14 +21,9 @@ from dyngs.deform.field import (
 )
 from dyngs.deform.keys import HexplaneField, MlpField
 from dyngs.gaussians.optimizer import Parameters
+from dyngs.ops.perceptron import Layer, perceptron
 from dyngs.ops.planes import PlaneLevel, hexplane_features, plane_penalty
 
-PENALTY_WEIGHTS = (1e-4, 0.01, 1e-4)
-"""Weights of the smoothness of space planes, smoothness along time, and sparsity of time planes.
-
-From Wu et al.
-"""
-LR_DECAY = 0.01  # ratio of the last to the first learning rate
 SPACE_RANGE = (0.1, 0.5)
 """Space planes start uniformly in this range, time planes at 1, so that features do not depend on
 time."""
@@ -36,7 +33,7 @@ class Hexplane(DeformationField):
     """Features from six planes per level, decoded into offsets (4DGS).
 
     Time spans the whole range of the planes. The decoder's last layer starts at zero, so that the
-    field starts as the identity. The last layer may mix the heads (block-diagonal in Wu et al.).
+    field starts as the identity.
     """
 
     def __init__(
@@ -44,7 +41,7 @@ class Hexplane(DeformationField):
     ) -> None:
         self.options, self.setup = options, setup
         tensors: dict[str, Tensor] = {}
-        rows = min(max(2, (setup.num_times + 1) // 2), MAX_KEY_TIMES)
+        rows = min(max(2, math.ceil(setup.num_times / options.times_per_row)), MAX_KEY_TIMES)
         for level, multiplier in enumerate(options.levels):
             side = options.resolution * multiplier
             low, high = SPACE_RANGE
@@ -56,11 +53,12 @@ class Hexplane(DeformationField):
             tensors[f"space{level}"] = space
             tensors[f"time{level}"] = torch.ones(3, rows, side, options.channels, device="cpu")
         hidden = [options.width] * options.depth + [options.width * len(head_sizes(options))]
-        self.decoder = Decoder(options.channels * len(options.levels), hidden, options)
+        num_features = options.channels * len(options.levels)
+        self.decoder = Decoder(num_features, hidden, options, separate_heads=options.separate_heads)
         rates = dict.fromkeys(tensors, options.lr_planes * setup.extent)
         weights = self.decoder.start_values(generator)
         rates |= dict.fromkeys(weights, options.lr_decoder * setup.extent)
-        self.parameters = Parameters(tensors | weights, rates, LR_DECAY)
+        self.parameters = Parameters(tensors | weights, rates, options.lr_decay)
 
     @property
     def levels(self) -> list[PlaneLevel]:
@@ -70,12 +68,14 @@ class Hexplane(DeformationField):
         ]
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
-        coords = self.setup.normalize(select_rows(means.detach(), rows))
+        if not self.options.position_gradient:
+            means = means.detach()
+        coords = self.setup.normalize(select_rows(means, rows))
         features = hexplane_features(coords, time, self.levels)
         return split_heads(self.decoder(features, self.parameters), self.options)
 
     def penalties(self, time: float) -> dict[str, Tensor]:
-        return {"plane smoothness": plane_penalty(self.levels, PENALTY_WEIGHTS)}
+        return {"plane smoothness": plane_penalty(self.levels, self.options.penalty_weights)}
 
     @torch.no_grad()
     def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None:
@@ -89,7 +89,7 @@ class Hexplane(DeformationField):
             planes[:, high + 1 : math.ceil(soon[1] * last) + 1] = planes[:, high, None]
 
 
-SPACE_FREQUENCIES, TIME_FREQUENCIES = 10, 6  # octaves of the positional encodings
+SPACE_FREQUENCIES = 10  # octaves of the encoding of positions
 MLP_LR_DECAY = 0.002  # ratio of the last to the first learning rate
 # This layer (counted from 0) gets the input again, in networks that are deep enough.
 SKIP_LAYER = 5
@@ -98,23 +98,37 @@ SKIP_LAYER = 5
 class Mlp(DeformationField):
     """Offsets from a deep network on encoded position and time (Deformable-3DGS).
 
-    Unlike the paper, time is encoded like position instead of by its own network, and scales
-    change in the logarithm, so that they stay positive. The last layer starts at zero.
+    Positions get no gradient through the network, as published. Unlike the paper, scales change in
+    the logarithm, so that they stay positive. The last layer starts at zero.
     """
 
     def __init__(self, options: MlpField, setup: FieldSetup, generator: torch.Generator) -> None:
         self.options, self.setup = options, setup
-        inputs = 3 * (1 + 2 * SPACE_FREQUENCIES) + 1 + 2 * TIME_FREQUENCIES
+        encoded_time = 1 + 2 * options.time_frequencies
+        inputs = 3 * (1 + 2 * SPACE_FREQUENCIES) + (options.time_features or encoded_time)
         skip = SKIP_LAYER if options.depth > SKIP_LAYER else None
         self.decoder = Decoder(inputs, [options.width] * options.depth, options, skip=skip)
         weights = self.decoder.start_values(generator)
+        if options.time_features:
+            widths = [encoded_time, options.width, options.time_features]
+            for i, (fan_in, fan_out) in enumerate(pairwise(widths)):
+                weights[f"time_weight{i}"] = glorot(fan_in, fan_out, generator)
+                weights[f"time_bias{i}"] = torch.zeros(fan_out, device="cpu")
         self.parameters = Parameters(weights, dict.fromkeys(weights, options.lr), MLP_LR_DECAY)
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
         space = encode_frequencies(
             self.setup.normalize(select_rows(means.detach(), rows)), SPACE_FREQUENCIES
         )
-        encoded_time = encode_frequencies(space.new_full((1, 1), time), TIME_FREQUENCIES)
+        encoded_time = encode_frequencies(
+            space.new_full((1, 1), time), self.options.time_frequencies
+        )
+        if self.options.time_features:
+            layers = [
+                Layer(self.parameters[f"time_weight{i}"], self.parameters[f"time_bias{i}"])
+                for i in range(2)
+            ]
+            encoded_time = perceptron(encoded_time, layers)
         features = torch.cat([space, encoded_time.expand(len(space), -1)], dim=1)
         return split_heads(self.decoder(features, self.parameters), self.options)
 

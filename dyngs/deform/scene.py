@@ -10,15 +10,17 @@ import torch
 from torch import Tensor
 
 from dyngs.core.state import Role, State, StateTensor, add_prefix, select_prefix
-from dyngs.core.tensor_checks import require_ascending, require_indices
+from dyngs.core.tensor_checks import require_ascending, require_indices, require_tensor
 from dyngs.deform.field import DeformationField, DeformedGaussians, MovingRows
 from dyngs.deform.fields import field_state, restore_field
+from dyngs.deform.gaussians_4d import Gaussians4D
 from dyngs.deform.keys import DynamicModel
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.filters import apply_filter, filter_state, restore_filter
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep, restore_times, times_state
 from dyngs.gaussians.visibility import VisibilityMasks, intersect_sorted
 from dyngs.models.renderable import Renderable, clamp_time
+from dyngs.ops.quaternions import identity_quat
 
 _NONE = torch.zeros(0, dtype=torch.long, device="cpu")
 
@@ -46,6 +48,9 @@ class DynamicScene(GaussianScene):
         rows = tensors.get("rows", torch.arange(count, device=gaussians.means.device))
         require_ascending("rows", require_indices("rows", rows, (None,), count))
         field = restore_field(options.deform, own, len(rows))
+        if "left_quats" in own:
+            left = require_tensor("left_quats", own["left_quats"], (len(rows), 4))
+            gaussians = gaussians.replace(quats=gaussians.quats.index_copy(0, rows, left))
         return DynamicScene(
             gaussians=gaussians,
             training_times=times,
@@ -117,6 +122,21 @@ class DynamicScene(GaussianScene):
             masks=None if self.masks is None else self.masks.select(edit.source),
             filter_std=None if self.filter_std is None else edit.apply(self.filter_std),
         )
+
+    def drawing_state(self) -> State:
+        """Return the tensors needed for rendering, with equivalent rotations of 4D Gaussians."""
+        state = super().drawing_state()
+        if isinstance(self.field, Gaussians4D) and len(self.moving):
+            quats = self.gaussians.quats.detach()
+            left, right = self.field.storage_quats(quats[self.moving])
+            if self.field.depends_on_view:  # which multiplies each number of a rotation
+                state["model.field.left_quats"] = StateTensor(quats[self.moving], Role.PER_MOVING)
+                left = identity_quat(left).expand_as(left)
+                right = self.field.parameters["right_quats"].detach()
+            left = quats.index_copy(0, self.moving, left)
+            state["gaussians.quats"] = StateTensor(left, Role.PER_GAUSSIAN)
+            state["model.field.learned.right_quats"] = StateTensor(right, Role.PER_MOVING)
+        return state
 
     def _model_state(self) -> State:
         state = filter_state(self.filter_std) | times_state(self.training_times)

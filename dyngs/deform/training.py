@@ -25,7 +25,7 @@ from dyngs.deform.fixed_cameras.hulls import FixedCameraClip
 from dyngs.deform.fixed_cameras.initial_motion import InitialMotion, find_initial_motion
 from dyngs.deform.free import FreeInitialization, FreePrimitives, initialize_free
 from dyngs.deform.gaussians_4d import Gaussians4D
-from dyngs.deform.keys import TIMED_FIELDS, DynamicModel
+from dyngs.deform.keys import TIMED_FIELDS, DynamicModel, MlpField
 from dyngs.deform.random_gaussians import box_of, random_gaussians, with_gaussians
 from dyngs.deform.scene import DynamicScene
 from dyngs.deform.schedule import DeformSchedule, TimeWindow
@@ -131,6 +131,7 @@ class DynamicTraining(SceneTraining[DynamicScene]):
     ) -> None:
         self.options, self.schedule, self.capture = options, schedule, capture
         self._has_lifetimes = isinstance(options.deform, TIMED_FIELDS)
+        self.means_decay_from = 0 if options.static_decay else schedule.coarse_end
         self.times = tuple(sorted(set(capture.times)))
         self._set_time_window(False)
         self._update, self._generator = update, generator
@@ -155,7 +156,7 @@ class DynamicTraining(SceneTraining[DynamicScene]):
     def time_step(self, scene: DynamicScene, image: Image, step: int) -> GaussianTimeStep:
         if scene.field is None:
             return scene.time_step(image.time)
-        time = image.time or 0.0
+        time = (image.time or 0.0) + self._time_noise(step)
         detach = self._window.is_frontier_step(step)
         now = scene.in_training(time, detach=detach, eye=image.cameras.centers[0])
         penalties = now.penalties | self._sparsity(now.offsets)
@@ -182,8 +183,8 @@ class DynamicTraining(SceneTraining[DynamicScene]):
     def split_in_time(
         self, scene: DynamicScene, result: EditResult, generator: torch.Generator
     ) -> EditResult:
-        is_split = isinstance(scene.field, Gaussians4D) and "log_scales" in result.changes
-        if not is_split or result.edit is None:
+        is_split = isinstance(scene.field, Gaussians4D) and "means" in result.changes
+        if not is_split or result.edit is None or scene.is_static:
             return result
         position = torch.full((len(scene),), -1, device=scene.device)
         position[scene.moving] = torch.arange(len(scene.moving), device=scene.device)
@@ -298,7 +299,9 @@ class DynamicTraining(SceneTraining[DynamicScene]):
 
     def _find_bodies(self, static: Gaussians) -> Bodies | None:
         """Find rigid bodies in the images of one moving camera."""
-        frame_stack = None if self._has_lifetimes else self.capture.frame_stack(static)
+        if self._has_lifetimes or not self.options.select_moving:
+            return None
+        frame_stack = self.capture.frame_stack(static)
         if frame_stack is None:
             return None
         return find_bodies(frame_stack, self.options.num_random_moving, static.sh.shape[1])
@@ -359,6 +362,15 @@ class DynamicTraining(SceneTraining[DynamicScene]):
             )
             moves &= errors.typical[scene.moving] > SURELY_STATIC * self.options.motion_threshold
         return _freeze(scene, mean, ~moves)
+
+    def _time_noise(self, step: int) -> float:
+        """Return a random offset of the time of a training view (Deformable-3DGS)."""
+        field = self.options.deform
+        remaining = 1 - 2 * step / self.schedule.rates.steps
+        if not isinstance(field, MlpField) or field.time_noise == 0 or remaining <= 0:
+            return 0.0
+        sample = torch.randn((), generator=self._generator, device="cpu")
+        return field.time_noise * remaining / len(self.times) * float(sample)
 
     def _sparsity(self, offsets: Offsets | None) -> dict[str, Tensor]:
         """Return the mean displacement as a regularisation term; Gaussians with a lifetime have

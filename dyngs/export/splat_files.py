@@ -220,14 +220,17 @@ def write_run_splats(
 ) -> WrittenFile:
     """Write a run at a time in [0, 1] as a file of Gaussians. The suffix selects the format.
 
-    The 3D filter is fused, and colours of a network become spherical harmonics. The header stores
-    the render mode, and the time of a moving scene.
+    Gaussians that do not exist at that time are left out. The 3D filter is fused, and colours of a
+    network become spherical harmonics. The header stores the render mode, and the time of a moving
+    scene.
 
     Raises:
         DyngsError: an empty part, or an unknown suffix.
     """
     collect_inputs(opened).require_output(path)
     splat = splats_at(opened, scene_part(opened.scene, part), time, how)
+    exists = splat.gaussians.opacities > 0
+    splat = replace(splat, gaussians=splat.gaussians.select(exists))
     splat, notes = _for_viewers(opened, splat, format_for_path(path), how)
     written = write_splats(path, splat, sh_degree=how.sh_degree)
     return replace(written, notes=(*notes, *written.notes))
@@ -400,8 +403,9 @@ class Tracks:
     positions: np.ndarray
     times: np.ndarray  # (T,) float64 in [0, 1]
     moving: np.ndarray  # (N,) bool
-    # (N,) int64 index of each Gaussian in the model, and its row in an exported .ply
+    # (N,) int64 index of each Gaussian in the model, and its row in an exported .ply if all exist
     ids: np.ndarray
+    visible: np.ndarray  # (N, T) bool: Gaussians with a lifetime exist at some times only
 
 
 def tracks_of(
@@ -424,11 +428,14 @@ def tracks_of(
     kind = np.float32 if frame == IDENTITY else np.float64
     whole = scene.without_masks()
     positions = np.empty((len(ids), len(times), 3), kind)
+    visible = np.empty((len(ids), len(times)), bool)
     for k, time in enumerate(times):
-        positions[:, k] = whole.at(time).means[ids].numpy()
+        now = whole.at(time)
+        positions[:, k] = now.means[ids].numpy()
+        visible[:, k] = (now.opacities[ids] > scene.options.alpha_min).numpy()
     if frame != IDENTITY:
         positions = frame.points(positions)
-    return Tracks(positions, np.array(times, np.float64), moves[ids].numpy(), ids.numpy())
+    return Tracks(positions, np.array(times, np.float64), moves[ids].numpy(), ids.numpy(), visible)
 
 
 def write_tracks(path: Path, tracks: Tracks) -> Path:

@@ -252,6 +252,9 @@ def plan_edit(
     """
     scale = parameters.log_scales.amax(1).exp()
     opaque = parameters.opacities >= options.prune_opacity
+    if len(scale) <= options.prune_above:
+        opaque = torch.ones_like(opaque)
+        max_scale = math.inf
     survives = opaque & (scale <= max_scale)
     wanted = opaque & (score >= options.grad_threshold)
     large = scale > DENSE_FRACTION * reference_length

@@ -46,8 +46,10 @@ class SceneTraining(Generic[S]):
         moves_by: name of the part that moves Gaussians, and the config section of its learning
             rates.
         colour_loss: image loss; None: L1 and D-SSIM.
+        means_decay_from: step from which the learning rate of positions decays.
     """
 
+    means_decay_from = 0
     deformation_name: tuple[str, str] = ("", "")
     colour_loss: Loss | None = None
 
@@ -239,7 +241,8 @@ class GaussianModel(Model[GaussianScene]):
     def update(self, step: int) -> UpdateResult:
         before = self._optimizer.parameters
         generator = self._generator
-        lr_means = means_rate(self._rates, self._rate_schedule.progress(step), self._run.extent)
+        progress = self._rate_schedule.progress(step, since=self.training.means_decay_from)
+        lr_means = means_rate(self._rates, progress, self._run.extent)
         frozen = self.colours.frozen_harmonics()
         skip_unseen_rows = self.training.skip_unseen_rows(self._scene)
         frozen_mask = self.training.frozen_mask()

@@ -162,6 +162,7 @@ _KINDS: dict[str, Kind] = {
     "gaussians.quats": "rotation",
     "gaussians.logit_opacities": "opacity",
     "gaussians.sh_rest": "sparse",
+    "model.field.learned.sh_time": "sparse",
     "triangles.harmonics": "sparse",
 }
 # Smallest and largest steps; the smallest one for rotations keeps the integers within LIMIT.

@@ -36,7 +36,7 @@ from dyngs.core.errors import DyngsError
 from dyngs.deform.keys import ControlNodesField, DynamicModel, HexplaneField, MlpField
 from dyngs.models.static_section import StaticModel
 
-PRESETS = ("static", "blender", "colmap", "static_mcmc", "mip")
+PRESETS = ("static", "blender", "colmap", "static_mcmc", "mip", "4dgs", "deformable_3dgs")
 ROOT = "data.root=capture"
 
 

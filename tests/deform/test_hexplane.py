@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from itertools import pairwise
 
+import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tiny_fields import cloud, stirred_field, tiny_field, tiny_options, tiny_setup
+from tiny_fields import cloud, stir, stirred_field, tiny_field, tiny_options, tiny_setup
 from torch import Tensor
 
 from dyngs.deform.keys import HexplaneField
@@ -104,3 +105,41 @@ def test_penalties_vanish_on_smooth_planes_only() -> None:
     assert not grad[2].any() or bool((field.parameters["time0"][2] != 1).any())
     field.levels[0].time.data[1, 2] += 0.1
     assert field.penalties(0.3)["plane smoothness"].detach() > rough.detach()
+
+
+@pytest.mark.parametrize("flows", [False, True])
+def test_gradient_of_positions_through_the_planes_is_optional(flows: bool) -> None:
+    field = stirred_field("hexplane")
+    assert isinstance(field, Hexplane)
+    field.options = field.options.model_copy(update={"position_gradient": flows})
+    means = cloud().means.requires_grad_()
+    moved = means + field.offsets(means, 0.3).means
+    moved.sum().backward()
+    assert means.grad is not None
+    assert bool((means.grad == 1).all()) != flows
+
+
+def test_separate_heads_read_their_own_hidden_units() -> None:
+    options = HexplaneField(
+        channels=3, resolution=5, width=8, moves=("rotations", "scales"), separate_heads=True
+    )
+    field = Hexplane(options, tiny_setup(), torch.Generator().manual_seed(0))
+    means = cloud().means
+    assert not outputs_at(field, means, 0.3).any()
+    stir(field)
+    before = field.offsets(means, 0.3)
+    field.parameters["bias1"].data[8:16] += 1.0  # hidden units of the second head
+    after = field.offsets(means, 0.3)
+    changes = [
+        not torch.equal(one, other)
+        for one, other in zip(vars(before).values(), vars(after).values(), strict=True)
+        if one is not None
+    ]
+    assert changes == [False, True, False]
+
+
+@pytest.mark.parametrize(("times_per_row", "rows"), [(2, 10), (4, 5), (1, 19), (30, 2)])
+def test_time_planes_have_a_row_for_several_times(times_per_row: float, rows: int) -> None:
+    options = HexplaneField(channels=1, resolution=2, width=2, times_per_row=times_per_row)
+    field = Hexplane(options, tiny_setup(num_times=19), torch.Generator())
+    assert field.levels[0].time.shape[1] == rows

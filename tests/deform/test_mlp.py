@@ -6,7 +6,7 @@ import math
 
 import pytest
 import torch
-from tiny_fields import cloud, tiny_setup
+from tiny_fields import cloud, stir, tiny_setup
 
 from dyngs.deform.field import Offsets
 from dyngs.deform.keys import MlpField
@@ -39,3 +39,17 @@ def test_deep_networks_see_the_input_once_more(depth: int, skips: bool) -> None:
         expected[SKIP_LAYER] += num_inputs
     assert widths == expected
     assert not any(x.any() for x in outputs(field.offsets(cloud().means, 0.3)))
+
+
+def test_time_may_be_encoded_by_a_network() -> None:
+    options = MlpField(depth=2, width=6, time_features=4, time_frequencies=10)
+    field = Mlp(options, tiny_setup(), torch.Generator().manual_seed(0))
+    assert field.parameters["time_weight0"].shape == (6, 1 + 2 * 10)
+    assert field.parameters["weight0"].shape == (6, 3 * (1 + 2 * 10) + 4)
+    means = cloud().means
+    assert not any(x.any() for x in outputs(field.offsets(means, 0.3)))
+    stir(field)
+    one, other = (field.offsets(means, time).means for time in (0.3, 0.8))
+    assert not torch.allclose(one, other)
+    one.sum().backward()
+    assert field.parameters["time_weight0"].grad is not None

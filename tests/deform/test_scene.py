@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tiny_fields import ALL_KINDS, cloud, stirred_field, tiny_options
+from tiny_fields import ALL_KINDS, cloud, moved, stirred_field, tiny_options
 from torch import Tensor
 
 from dyngs.core.state import strip_roles
-from dyngs.deform.field import DeformationField, apply_offsets
+from dyngs.deform.field import DeformationField
 from dyngs.deform.fields import field_state
 from dyngs.deform.keys import DynamicModel
 from dyngs.deform.scene import DynamicScene
@@ -95,12 +95,9 @@ def test_scene_loads_from_a_checkpoint(kind: str, rows: Tensor | None) -> None:
     assert scene.times == (0.0, 0.25, 1.0)
     assert torch.equal(scene.rows, torch.arange(9) if rows is None else rows)
     assert scene.is_static == (num_moving == 0)
-    means = gaussians.means if rows is None else gaussians.means[rows]
     with torch.no_grad():
-        moved = (
-            apply_offsets(gaussians, field.offsets(means, 0.3), rows) if num_moving else gaussians
-        )
-    assert same(scene.at(0.3), fuse_filter(moved, torch.ones(9)))
+        expected = moved(field, gaussians, 0.3, rows) if num_moving else gaussians
+    assert same(scene.at(0.3), fuse_filter(expected, torch.ones(9)))
 
 
 @pytest.mark.parametrize("kind", ALL_KINDS)

@@ -15,6 +15,7 @@ from moving_training import (
     FOCAL,
     FULL,
     SPLIT,
+    STEPS,
     THRESHOLD,
     TIMES,
     alike,
@@ -29,7 +30,7 @@ from static_balls import Ball, filmed
 from tiny_fields import KINDS, stir, tiny_options
 
 from dyngs.config import OptimConfig
-from dyngs.deform.keys import DynamicModel, FreeField
+from dyngs.deform.keys import DynamicModel, FreeField, MlpField
 from dyngs.deform.schedule import DeformSchedule
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.optimizer import GaussianOptimizer
@@ -183,6 +184,43 @@ def test_motion_sparsity_is_the_mean_length_in_extents() -> None:
     penalty = run.time_step(1.0, FINE + 1).penalties["motion sparsity"]
     assert float(penalty.detach()) == pytest.approx(0.5 * 4.0, rel=1e-5)
     assert begun(gaussians).time_step(1.0, FINE + 1).penalties == {}
+
+
+def test_all_gaussians_may_enter_the_field() -> None:
+    """Without differences from the static model, and without a search for rigid bodies."""
+
+    def searched(_: Gaussians) -> None:
+        raise AssertionError
+
+    gaussians = flat_cloud()
+    run = new_run(gaussians, select_moving=False)
+    run.training.capture = replace(run.training.capture, frame_stack=searched)
+    assert run.grow(FINE) is not None
+    assert run.scene.moving.tolist() == list(range(len(gaussians)))
+
+
+def test_noise_of_training_times_falls_to_zero_in_half_of_the_run() -> None:
+    run = begun(flat_cloud())
+    move(run, torch.ones(9))  # from -1 at time 0 to 1 at time 1
+    noisy = begun(flat_cloud(), deform=MlpField(time_noise=0.5))
+    noisy.scene = run.scene
+
+    def deviations(step: int) -> torch.Tensor:
+        without = run.time_step(0.5, step).gaussians.means[0, 0]
+        found = [noisy.time_step(0.5, step).gaussians.means[0, 0] for _ in range(200)]
+        return (torch.stack(found) - without).detach()
+
+    expected = 2 * 0.5 * (1 - 2 * 5 / STEPS) / len(TIMES)
+    assert float(deviations(5).std()) == pytest.approx(expected, rel=0.2)
+    assert not deviations(STEPS // 2).any()
+
+
+def test_rate_of_positions_may_start_to_decay_with_motion() -> None:
+    starts = [
+        begun(flat_cloud(), static_decay=decays).training.means_decay_from
+        for decays in (True, False)
+    ]
+    assert starts == [0, FINE]
 
 
 # --- freezing

@@ -15,8 +15,10 @@ from numpy.typing import NDArray
 from scene_kinds import scene_of_kind
 
 from dyngs.deform.field import Offsets
+from dyngs.deform.fields import WindowedField
+from dyngs.deform.scene import DynamicScene
 from dyngs.export import html
-from dyngs.export.html.scene_data import CHUNK, PackedArrays, add_scene, fit_splines
+from dyngs.export.html.scene_data import CHUNK, PackedArrays, add_scene, fit_splines, motion_splines
 from dyngs.human.avatar.scene import as_human_scene
 from dyngs.human.body.skinning import axis_angle_to_matrix
 from dyngs.ops.quaternions import rotation_matrices
@@ -86,6 +88,20 @@ def test_pieces_are_added_until_places_are_near() -> None:
     assert limited["means"].shape == (1, 2 * 19 + 3, 3)
     _, between_few_times = fit_splines(swinging, 3, 0.01)
     assert between_few_times <= 0.01
+
+
+def test_windows_in_time_and_lines_are_stored_as_they_are() -> None:
+    scene = scene_of_kind("windowed")
+    assert isinstance(scene, DynamicScene)
+    assert isinstance(scene.field, WindowedField)
+    means = scene.gaussians.means[scene.moving]
+    curves = motion_splines(scene.field, means, 3, 0.01)
+    assert curves.windows is scene.field.edges
+    lists = PackedArrays()
+    header = add_scene(scene_of_kind("gaussians_4d"), lists, 0.01)
+    assert header["lines"] == {"moving": 4, "least": 0.05, "waves": 2}
+    assert "curves" not in header
+    assert read(lists, "lines").shape == (4, 5)
 
 
 FOLDER = files(html)

@@ -188,6 +188,7 @@ def test_tracks_are_the_positions_of_the_scene() -> None:
     assert (tracks.times.tolist(), tracks.times.dtype) == (list(times), np.float64)
     assert tracks.moving.tolist() == [False, True, False, True, False]
     assert tracks.ids.tolist() == [0, 1, 2, 3, 4]
+    assert tracks.visible.all()
     part = tracks_of(moving_scene(Sliding()), TRAIN_TIMES, part="moving")
     wanted = expected(TRAIN_TIMES)[list(MOVING_ROWS)]
     np.testing.assert_allclose(part.positions, wanted, atol=1e-6)
@@ -206,7 +207,7 @@ def test_a_file_of_tracks_holds_arrays_without_pickle(tmp_path: Path) -> None:
     tracks = tracks_of(moving_scene(Sliding()), TRAIN_TIMES)
     path = write_tracks(tmp_path / "new" / "tracks.npz", tracks)
     with np.load(path, allow_pickle=False) as stored:
-        assert sorted(stored.files) == ["ids", "moving", "positions", "times"]
+        assert sorted(stored.files) == ["ids", "moving", "positions", "times", "visible"]
         for name in stored.files:
             np.testing.assert_array_equal(stored[name], getattr(tracks, name), strict=True)
     first = path.read_bytes()

@@ -121,6 +121,18 @@ def test_reset_lowers_opacities_and_clears_their_moments() -> None:
     )
 
 
+@pytest.mark.parametrize(("limit", "source"), [(2, [1]), (3, [0, 1, 2])])
+def test_small_scenes_may_be_exempt_from_pruning(limit: int, source: list[int]) -> None:
+    """Of three Gaussians, one is faint and one too large."""
+    densifier = _densifier(DefaultStrategy(prune_above=limit))
+    _signal(densifier, [0.0, 0.0, 0.0])
+    gaussians = _gaussians([SMALL, SMALL, 5.0], [0.001, 0.5, 0.5])
+    result = densifier.edit(400, gaussians, torch.Generator())
+    assert result is not None
+    assert result.edit is not None
+    assert result.edit.source.tolist() == source
+
+
 def test_pruning_keeps_at_least_one_gaussian() -> None:
     densifier = _densifier()
     _signal(densifier, [1.0, 1.0, 1.0])

@@ -18,6 +18,7 @@ from dyngs.config import (
     SceneModel,
     TrainConfig,
 )
+from dyngs.config.io import load_config, packaged_preset
 from dyngs.deform.keys import DynamicModel
 from dyngs.deform.schedule import deform_schedule
 from dyngs.gaussians.schedule import (
@@ -28,6 +29,7 @@ from dyngs.gaussians.schedule import (
     active_sh_degree,
     densify_schedule,
     filter_steps,
+    grad_threshold,
     growth_per_change,
     means_rate,
     rate_factors,
@@ -57,6 +59,29 @@ def test_published_schedule_at_30000_steps() -> None:
     assert mcmc.resets == ()
     assert growth_per_change(30_000) == 0.05
     assert filter_steps(DefaultStrategy(), 30_000) == range(15_000, 29_901, 100)
+
+
+@pytest.mark.parametrize(
+    ("preset", "stop", "resets"),
+    [
+        ("4dgs", 18_000, (3000, 6000, 9000, 12_000, 15_000)),
+        ("deformable_3dgs", 15_000, (3000, 6000, 9000, 12_000)),
+    ],
+)
+def test_published_schedules_of_moving_scenes(
+    preset: str, stop: int, resets: tuple[int, ...]
+) -> None:
+    """Both train a static model for 3,000 steps."""
+    config = load_config(packaged_preset(preset), ["data.root=capture"])
+    steps = config.train.steps
+    assert isinstance(config.model, DynamicModel)
+    assert isinstance(config.strategy, DefaultStrategy)
+    schedule = densify_schedule(config.strategy, steps, config.data.background == "white")
+    assert (schedule.start, schedule.stop, schedule.every) == (500, stop, 100)
+    assert schedule.resets == resets
+    assert grad_threshold(config.strategy, steps) == pytest.approx(2e-4, rel=2e-3)
+    assert deform_schedule(config.model, RateSchedule(steps)).coarse_end == 3000
+    assert [active_sh_degree(config.train, step, 3) for step in (999, 1000, 3000)] == [0, 1, 3]
 
 
 @settings(max_examples=25, deadline=None)

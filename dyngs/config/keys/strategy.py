@@ -38,6 +38,12 @@ class DefaultStrategy(Section):
     )
     every: int | None = Field(default=None, ge=1, description=_EVERY)
     prune_opacity: Fraction = Field(default=0.005, description=_PRUNE_OPACITY)
+    prune_above: int = Field(
+        default=0,
+        ge=0,
+        description="number of Gaussians above which transparent and too large ones are pruned; "
+        "4DGS: 200,000",
+    )
     reset_every: int | None = Field(
         default=3000,
         ge=1,

@@ -87,17 +87,17 @@ class Drawing {
 
   prepareHarmonics() {
     const { lists, count, degree } = this.scene;
-    if (degree) this.list("uHarmonics", packedHarmonics(lists, count, this.harmonicTexels), "16F");
+    if (degree) this.list("uHarmonics", packedRows(lists.rest, count, this.harmonicTexels), "16F");
   }
 }
 
-// The other harmonics of `count` Gaussians or triangles, in so many texels each.
-function packedHarmonics(lists, count, texels) {
-  const columns = lists.rest.length / count, width = 4 * texels;
-  const rest = new Float32Array(width * count);
+// `count` rows of numbers, such as the other harmonics of Gaussians or triangles, in so many texels each.
+function packedRows(values, count, texels) {
+  const columns = values.length / count, width = 4 * texels;
+  const packed = new Float32Array(width * count);
   for (let i = 0; i < count; ++i)
-    for (let k = 0; k < columns; ++k) rest[width * i + k] = lists.rest[columns * i + k];
-  return rest;
+    for (let k = 0; k < columns; ++k) packed[width * i + k] = values[columns * i + k];
+  return packed;
 }
 
 // Where a camera of camFromWorld stands.

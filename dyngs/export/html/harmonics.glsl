@@ -41,6 +41,9 @@ vec3 harmonics(int i, vec3 d) {
     vec4 texel = at(uHarmonics, HARMONIC_TEXELS * i + t);
     for (int k = 0; k < 4; ++k) values[4 * t + k] = texel[k];
   }
+#if WAVE_TEXELS
+  if (i < LINES) for (int k = 0; k < 3 * COUNT; ++k) values[k] += waves[3 + k];
+#endif
   for (int k = 0; k < COUNT; ++k) color += basis[k] * vec3(values[3 * k], values[3 * k + 1], values[3 * k + 2]);
 #endif
   return color;

@@ -183,6 +183,6 @@ class LevelRenderer extends Renderer {
     this.motion.means.set(lists.means, 3 * block * slot);
     this.write(this.gaussians, 4 * block * slot, packedGaussians(lists, block));
     const texels = this.harmonicTexels;
-    if (degree) this.write(this.harmonics, texels * block * slot, packedHarmonics(lists, block, texels));
+    if (degree) this.write(this.harmonics, texels * block * slot, packedRows(lists.rest, block, texels));
   }
 }

@@ -160,6 +160,7 @@ class Motion {
     this.drivers = scene.curves ? new Drivers(scene, chunks) : null;
     this.bones = scene.bones ? new Bones(scene) : null;
     this.means = lists.means;
+    this.lines = scene.lines && { ...scene.lines, list: lists.lines };
     this.windows = lists.windows; // when each Gaussian that moves is there: from, to
     this.masks = scene.masks ? { times: scene.masks.times, bits: lists.masks, bytes: Math.ceil(this.count / 8) } : null;
     if (this.drivers) {
@@ -174,7 +175,7 @@ class Motion {
   }
 
   get moves() {
-    return Boolean(this.drivers || this.bones);
+    return Boolean(this.drivers || this.bones || this.lines);
   }
 
   // Whether all is here that it needs at a time.
@@ -207,6 +208,7 @@ class Motion {
     if (this.bones) return this.depthsOnBones(row, out);
     for (let i = this.moving; i < count; ++i)
       out[i] = x * means[3 * i] + y * means[3 * i + 1] + z * means[3 * i + 2] + w;
+    if (this.lines) this.addDepthsOnLines(row, out);
     if (!this.drivers) return undefined;
     const axes = axesThrough(this.drivers.values, 24, this.drivers.count, [x, y, z]);
     for (let i = 0; i < this.moving; ++i) {
@@ -219,6 +221,16 @@ class Motion {
       out[i] = depth;
     }
     return undefined;
+  }
+
+  // Moves 4D Gaussians along their lines; those that have faded are not drawn.
+  addDepthsOnLines([x, y, z], out) {
+    const { moving, least, list } = this.lines, reach = Math.sqrt(-2 * Math.log(least));
+    for (let i = 0; i < moving; ++i) {
+      const [vx, vy, vz, mean, logStd] = list.subarray(5 * i, 5 * i + 5), elapsed = this.time - mean;
+      if (Math.abs(elapsed) < reach * Math.exp(logStd)) out[i] += elapsed * (x * vx + y * vy + z * vz);
+      else out[i] = -Infinity;
+    }
   }
 
   depthsOnBones([x, y, z, w], out) {

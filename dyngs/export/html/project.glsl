@@ -18,6 +18,8 @@ uniform sampler2D uBonedShares;  // 2: their shares
 uniform usampler2D uDriven;      // its drivers
 uniform sampler2D uDrivenShares; // their shares
 uniform sampler2D uWindows;      // half of one: when its window in time begins and ends
+uniform sampler2D uLines;        // 2: velocity, mean time; log of the standard deviation of its opacity over time
+uniform sampler2D uWaves;        // WAVES times WAVE_TEXELS: the harmonics of each cosine in time
 // Of each driver, each bone, and the network:
 uniform sampler2D uDrivers;      // 6: rows of the affine map; changes of quaternion; of log scales and logit; of colour
 uniform sampler2D uBones;        // 3: rows of the affine map
@@ -137,6 +139,31 @@ void bend(int i, inout Gaussian g) {
 }
 #endif
 
+#if LINES
+#if WAVE_TEXELS
+float waves[4 * WAVE_TEXELS];  // what the cosines in time add to the harmonics
+#endif
+
+// Moves a 4D Gaussian along its line and changes its colour. Returns the factor of its opacity.
+float advance(int i, inout Gaussian g) {
+  vec4 line = at(uLines, 2 * i);
+  float elapsed = uTime - line.w, spans = elapsed * exp(-at(uLines, 2 * i + 1).x);
+  g.mean += elapsed * line.xyz;
+#if WAVE_TEXELS
+  for (int k = 0; k < 4 * WAVE_TEXELS; ++k) waves[k] = 0.0;
+  for (int n = 0; n < WAVES; ++n) {
+    float amplitude = cos(6.283185307179586 * float(n + 1) * elapsed);
+    for (int t = 0; t < WAVE_TEXELS; ++t) {
+      vec4 texel = at(uWaves, (WAVES * i + n) * WAVE_TEXELS + t);
+      for (int k = 0; k < 4; ++k) waves[4 * t + k] += amplitude * texel[k];
+    }
+  }
+  g.base += vec3(waves[0], waves[1], waves[2]);
+#endif
+  return exp(-0.5 * spans * spans);
+}
+#endif
+
 #include "harmonics.glsl"
 
 #if LAYERS
@@ -207,10 +234,14 @@ void main() {
 #if BONES
   bend(i, g);
 #endif
+  float weight = 1.0;
+#if LINES
+  if (i < LINES) weight = advance(i, g);
+#endif
   vec3 p = (uCamFromWorld * vec4(g.mean, 1.0)).xyz;
   if (!(p.z > uLimits.y && p.z < FARTHEST)) return;
   vec3 scales = exp(g.logScales);
-  float opacity = 1.0 / (1.0 + exp(-g.logit));
+  float opacity = weight / (1.0 + exp(-g.logit));
 #if FILTERED
   vec3 wider = sqrt(scales * scales + g.filterStd * g.filterStd);
   vec3 shares = scales / wider;

@@ -12,6 +12,8 @@ class Renderer extends Drawing {
     // Eight bits are few for hundreds of layers: blended in half floats where they can be drawn to.
     this.deep = Boolean(gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float"));
     this.order = new DepthOrder(scene.count);
+    // texels of a cosine of all harmonics of a Gaussian
+    this.waveTexels = scene.lines && scene.lines.waves ? Math.ceil((3 * (scene.degree + 1) ** 2) / 4) : 0;
     this.prepareLists();
     this.project = this.program("project.glsl", null, CORNERS, this.definitions());
     this.splat = this.program("splat.vert.glsl", "splat.frag.glsl");
@@ -27,6 +29,9 @@ class Renderer extends Drawing {
       DEGREE: scene.degree,
       HARMONIC_TEXELS: this.harmonicTexels,
       MOVING: motion.moving,
+      LINES: scene.lines ? scene.lines.moving : 0,
+      WAVES: scene.lines ? scene.lines.waves : 0,
+      WAVE_TEXELS: this.waveTexels,
       WINDOWED: motion.windows ? 1 : 0,
       EDGE: motion.windows ? scene.curves.edge.toFixed(6) : 1,
       OPEN: motion.windows ? scene.curves.open.map((x) => x.toFixed(6)).join(", ") : 0,
@@ -45,6 +50,7 @@ class Renderer extends Drawing {
     this.list("uGaussians", packedGaussians(lists, count), "32F");
     this.prepareHarmonics();
     if (motion.drivers) this.prepareDrivers();
+    if (scene.lines) this.prepareLines();
     if (motion.bones) {
       this.bones = this.list("uBones", motion.bones.values, "32F");
       this.list("uBoned", motion.boned, "16UI");
@@ -69,6 +75,12 @@ class Renderer extends Drawing {
       this.list("uDrivenShares", motion.shares, "32F");
     }
     if (motion.windows) this.list("uWindows", motion.windows, "32F");
+  }
+
+  prepareLines() {
+    const { lines, lists } = this.scene;
+    this.list("uLines", packedRows(lists.lines, lines.moving, 2), "32F");
+    if (lines.waves) this.list("uWaves", packedRows(lists.waves, lines.waves * lines.moving, this.waveTexels), "16F");
   }
 
   prepareBuffers() {

@@ -25,6 +25,7 @@ from dyngs.deform.control_nodes import FOLLOWED, ControlNodes, spline_basis
 from dyngs.deform.field import DeformationField, Offsets
 from dyngs.deform.fields import EDGE_WIDTH, OPEN_WINDOW, WindowedField
 from dyngs.deform.free import FreePrimitives
+from dyngs.deform.gaussians_4d import MIN_WEIGHT, Gaussians4D
 from dyngs.deform.scene import DynamicScene, field_scene_of
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.colour.network import ColourNetwork
@@ -120,7 +121,8 @@ def add_scene(scene: GaussianScene, lists: PackedArrays, tolerance: float) -> di
     if person is not None:
         header |= _add_person(person, order, lists, tolerance)
     elif moved is not None:
-        header |= _add_motion(moved, order, lists, tolerance)
+        motion, gaussians = _add_motion(moved, order, lists, tolerance)
+        header |= motion
     includes_harmonics = scene.colour is None
     header |= _add_gaussians(
         gaussians.select(order).detach(), lists, includes_harmonics=includes_harmonics
@@ -182,17 +184,24 @@ def _add_gaussians(
 
 def _add_motion(
     scene: DynamicScene, order: Tensor, lists: PackedArrays, tolerance: float
-) -> dict[str, Any]:
-    """Add the motion of a scene whose Gaussians are stored in ``order``, moving ones first."""
+) -> tuple[dict[str, Any], Gaussians]:
+    """Add the motion of a scene whose Gaussians are stored in ``order``, moving ones first.
+
+    Returns the header fields and the Gaussians that the motion applies to.
+    """
+    gaussians = scene.gaussians
     if scene.field is None:
-        return {}
+        return {}, gaussians
     place = torch.full((len(scene),), -1, device="cpu")
     place[scene.moving] = torch.arange(len(scene.moving), device="cpu")
     mine = place[order[: len(scene.moving)]]
-    curves = motion_splines(
-        scene.field, scene.gaussians.means[scene.moving], len(scene.times), tolerance
-    )
-    header: dict[str, Any] = {"curves": _add_curves(curves, mine, lists)}
+    header: dict[str, Any] = {}
+    if isinstance(scene.field, Gaussians4D):
+        header["lines"], gaussians = _add_lines(scene, scene.field, mine, lists)
+    else:
+        means = gaussians.means[scene.moving]
+        curves = motion_splines(scene.field, means, len(scene.times), tolerance)
+        header["curves"] = _add_curves(curves, mine, lists)
     if scene.filter_std is not None:
         lists.quantised("filter_std", _numpy(scene.filter_std[order][:, None]), 8)
         header["filtered"] = True
@@ -200,7 +209,28 @@ def _add_motion(
         masks = scene.masks.select(order)
         lists.exact("masks", masks.bits.numpy())
         header["masks"] = {"times": list(masks.times)}
-    return header
+    return header, gaussians
+
+
+def _add_lines(
+    scene: DynamicScene, field: Gaussians4D, order: Tensor, lists: PackedArrays
+) -> tuple[dict[str, Any], Gaussians]:
+    """Add lines, opacities and colours over time of 4D Gaussians in ``order`` (M,).
+
+    Returns the header fields and all Gaussians with the covariances that the moving ones have at
+    every time.
+    """
+    moving = field.linear(scene.gaussians.select(scene.moving))
+    tensors = scene.gaussians.tensors()
+    for name, values in moving.gaussians.tensors().items():
+        tensors[name] = tensors[name].index_copy(0, scene.moving, values)
+    now = Gaussians(**tensors)
+    times = torch.stack([moving.times, moving.log_stds], dim=1)
+    lists.exact("lines", _numpy(torch.cat([moving.velocities, times], dim=1)[order]))
+    header = {"moving": len(order), "least": MIN_WEIGHT, "waves": field.num_waves}
+    if field.num_waves:
+        lists.quantised("waves", _numpy(field.parameters["sh_time"][order].flatten(1)), 8)
+    return header, now
 
 
 def _add_curves(curves: MotionSplines, order: Tensor, lists: PackedArrays) -> dict[str, Any]:
@@ -352,8 +382,8 @@ def motion_splines(
 ) -> MotionSplines:
     """Return the motion of ``means`` (M, 3) as splines."""
     match field:
-        case WindowedField(others=others):
-            return replace(motion_splines(others, means, num_times, tolerance), windows=field.edges)
+        case WindowedField(inner_field=inner):
+            return replace(motion_splines(inner, means, num_times, tolerance), windows=field.edges)
         case ControlNodes():
             return _curves_of_nodes(field, means)
         case FreePrimitives():  # lines and parabolas

@@ -10,6 +10,7 @@ class TriangleRenderer extends Drawing {
     this.prepareHarmonics();
     this.faces = this.program("triangles.vert.glsl", "triangles.frag.glsl", null, {
       ROW, DEGREE: degree, HARMONIC_TEXELS: this.harmonicTexels, TEXTURE: texture, COLOURS: colours,
+      WAVE_TEXELS: 0,
     });
     this.copy = this.program("copy.vert.glsl", "copy.frag.glsl");
     this.prepareMesh();
