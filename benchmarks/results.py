@@ -108,14 +108,8 @@ MEASUREMENTS = {
     "lego400_bg_triangle": Measurement(
         "systems", "lego", "lego400", "bg_triangle", ("data.longest_side=200",)
     ),
-    "orbits_hexplane": Measurement(
-        "systems", "orbits", "orbits", "dynamic",
-        ("model.pilot_runs=false", "model.deform.kind=hexplane"),
-    ),
-    "orbits_mlp": Measurement(
-        "systems", "orbits", "orbits", "dynamic",
-        ("model.pilot_runs=false", "model.deform.kind=mlp"),
-    ),
+    "orbits_4dgs": Measurement("systems", "orbits", "orbits", "4dgs"),
+    "orbits_deformable_3dgs": Measurement("systems", "orbits", "orbits", "deformable_3dgs"),
     "orbits_gaussians_4d": Measurement("systems", "orbits", "orbits", "gaussians_4d"),
     "stage_free": Measurement(
         "systems", "stage", "stage", "dynamic",
@@ -430,9 +424,12 @@ def own_figures(
             figures.append(f"{Path(result.capture).name} {psnr_cell(result)}")
             protocols.append(f"{result.image_size}, {result.steps:,} steps")
             commits.append(result.commit)
-    for (capture, variant), seeds in group_rows(moving).items():
-        measured = [row for row in seeds if "refused" not in row]
-        if variant == system.get("variant") and measured:
+    measured_rows = [row for row in moving if "refused" not in row]
+    stored = {row["variant"] for row in measured_rows}
+    # The first variant that is stored
+    wanted = next((name for name in system.get("variants", ()) if name in stored), None)
+    for (capture, variant), measured in group_rows(measured_rows).items():
+        if variant == wanted:
             figures.append(f"{capture} {spread_cell([row['psnr'] for row in measured], '.2f')}")
             protocols.append(f"{measured[0]['minutes']:g} minutes, one thread")
             commits += [row["commit"] for row in measured]

@@ -22,6 +22,7 @@ from dyngs.deform.field import (
     DeformedGaussians,
     FieldSetup,
     MovingRows,
+    OpacityWindow,
     select_rows,
 )
 from dyngs.deform.free import FreeInitialization
@@ -177,6 +178,25 @@ class Gaussians4D(DeformationField):
         )
         conditioned = gaussians.replace(means=means, quats=quats, log_scales=log_scales)
         return LinearGaussians(conditioned, velocities, times[:, 0], log_stds)
+
+    @torch.no_grad()
+    def lifetimes(self, gaussians: Gaussians) -> Tensor | None:
+        if self.depends_on_view:  # which may lengthen them
+            return None
+        motion = self.linear(gaussians)
+        # A little longer, because slicing rounds otherwise.
+        reach = (1 + 1e-4) * math.sqrt(-2 * math.log(MIN_WEIGHT)) * motion.log_stds.double().exp()
+        return motion.times.double()[:, None] + torch.stack([-reach, reach], dim=1)
+
+    @torch.no_grad()
+    def opacity_window(self, gaussians: Gaussians, time: float) -> OpacityWindow:
+        motion = self.linear(gaussians)
+        log_stds = motion.log_stds.double()
+        elapsed = time - motion.times.double()
+        # limits keep all factors finite; the density is 0 at 40 standard deviations
+        squares = (elapsed * (-log_stds).exp()).square().clamp_max(1600)
+        curvature = (squares - 1) * (-0.5 * squares - 2 * log_stds.clamp_min(-300)).exp()
+        return OpacityWindow(curvature, self.parameters["log_spans"][:, 0].double())
 
     def _colours(self, sh: Tensor, elapsed: Tensor, visible: Tensor | None) -> Tensor:
         """Return SH coefficients (A, K, 3), ``elapsed`` (A, 1) clips after the mean times."""

@@ -12,6 +12,7 @@ COPIES_OF_MOVING = 12_000
 """Most copies over time of the moving Gaussians that free primitives start with."""
 
 
+Weight = Annotated[float, Field(ge=0)]
 Attribute = Literal["rotations", "scales", "opacities", "colors"]
 
 
@@ -68,7 +69,7 @@ class HexplaneField(FieldSection):
         default=False,
         description="whether positions also receive the gradient through the planes, as in 4DGS",
     )
-    penalty_weights: tuple[float, float, float] = Field(
+    penalty_weights: tuple[Weight, Weight, Weight] = Field(
         default=(1e-4, 0.01, 1e-4),
         description="weights of the smoothness of space planes, smoothness along time, and "
         "sparsity of time planes; 4DGS: 2e-4, 1e-3, 1e-4 for real captures",

@@ -93,6 +93,24 @@ class DynamicScene(GaussianScene):
         from_eye = (lambda eye: deform(eye=eye).gaussians) if self.field.depends_on_view else None
         return GaussianTimeStep(deform().gaussians, now, from_eye=from_eye)
 
+    def drawing_step(self, time: float | None) -> GaussianTimeStep:
+        """Return ``time_step``; without gradients only the Gaussians that are drawn at ``time``."""
+        if self.field is None or self.is_static or torch.is_grad_enabled():
+            return self.time_step(time)
+        if "lifetimes" not in self._derived:
+            moving = self.gaussians.picked(self.moving)
+            self._derived["lifetimes"] = self.field.lifetimes(moving)
+        lifetimes = self._derived["lifetimes"]
+        if lifetimes is None:
+            return self.time_step(time)
+        now = clamp_time(time)
+        is_drawn = torch.ones(len(self), dtype=torch.bool, device=self.device)
+        is_drawn[self.moving] = (lifetimes[:, 0] <= now) & (now <= lifetimes[:, 1])
+        if self.masks is not None:
+            is_drawn &= self.masks.visible(self.masks.interval(now))
+        part = self._select(self.gaussians, torch.nonzero(is_drawn)[:, 0])
+        return GaussianTimeStep(part.deform(self.field, now).gaussians, now)
+
     def in_training(
         self, time: float, *, detach: bool, eye: Tensor | None = None
     ) -> DeformedGaussians:
@@ -102,8 +120,9 @@ class DynamicScene(GaussianScene):
         """
         if self.field is None:
             raise ValueError("the scene has no deformation field")
-        interval = 0 if self.masks is None else self.masks.interval(time)
-        part = self._select_visible(self.gaussians.detach() if detach else self.gaussians, interval)
+        part = self._select(
+            self.gaussians.detach() if detach else self.gaussians, self._active(time)
+        )
         return part.deform(self.field, time, in_training=True, eye=eye)
 
     def apply_edit(self, edit: TopologyEdit) -> DynamicScene:
@@ -145,22 +164,26 @@ class DynamicScene(GaussianScene):
             state["rows"] = StateTensor(self.moving, Role.SHARED)
         return state if self.masks is None else state | add_prefix("masks", self.masks.state())
 
+    def _active(self, time: float) -> Tensor | None:
+        """Return ascending indices (A,) of the Gaussians that the masks show at ``time``; None:
+        all."""
+        return None if self.masks is None else self.masks.active(self.masks.interval(time))
+
     def _visible_around(self, time: float) -> _VisiblePart:
         """Return the visible part around ``time``; without gradients the last one is cached."""
-        interval = 0 if self.masks is None else self.masks.interval(time)
         if torch.is_grad_enabled():
-            return self._select_visible(self.gaussians, interval)
-        if interval not in self._derived:
-            self._derived.clear()
-            self._derived[interval] = self._select_visible(self.gaussians, interval)
-        return self._derived[interval]
+            return self._select(self.gaussians, self._active(time))
+        interval = 0 if self.masks is None else self.masks.interval(time)
+        if self._derived.get("interval") != interval:
+            self._derived["interval"] = interval
+            self._derived["part"] = self._select(self.gaussians, self._active(time))
+        return self._derived["part"]
 
-    def _select_visible(self, gaussians: Gaussians, interval: int) -> _VisiblePart:
+    def _select(self, gaussians: Gaussians, active: Tensor | None) -> _VisiblePart:
         means = gaussians.means.index_select(0, self.moving)
-        if self.masks is None:
+        if active is None:
             rows = None if len(self.moving) == len(self) else self.moving
             return _VisiblePart(gaussians, self.filter_std, MovingRows(means, None, rows))
-        active = self.masks.active(interval)
         std = None if self.filter_std is None else self.filter_std[active]
         visible_rows, rows = intersect_sorted(self.moving, active, len(self))
         moving = MovingRows(means, visible_rows, rows)

@@ -132,6 +132,9 @@ class GaussianScene(Renderable):
     def time_step(self, time: float | None) -> GaussianTimeStep:
         """Return the Gaussians at ``time``, clamped to [0, 1]; None is the first time."""
 
+    def drawing_step(self, time: float | None) -> GaussianTimeStep:
+        return self.time_step(time)
+
     def at(self, time: float | None) -> Gaussians:
         """Return the Gaussians of ``time_step`` without gradients."""
         with torch.no_grad():
@@ -162,7 +165,7 @@ class GaussianScene(Renderable):
         Raises:
             DyngsError: as ``dyngs.gaussians.rendering.render``.
         """
-        now = time if isinstance(time, GaussianTimeStep) else self.time_step(_time_value(time))
+        now = time if isinstance(time, GaussianTimeStep) else self.drawing_step(_time_value(time))
         behind = self.background if background is None else background
         how = self.options if options is None else options
         device = now.gaussians.means.device
