@@ -171,6 +171,12 @@ class Gaussians4DField(Section):
         default=5e-6,
         description="mean gradient by the mean time, in clips, above which Gaussians are cloned or split",
     )
+    predictor_width: int = Field(
+        default=0,
+        ge=0,
+        description="neurons per layer of a network that deforms the moving Gaussians by view and time; 0: none; "
+        "MEGA: 256",
+    )
 
 
 DeformField = HexplaneField | MlpField | ControlNodesField | FreeField | Gaussians4DField
@@ -263,4 +269,6 @@ class DynamicModel(SceneModel):
     @property
     def bytes_per_moving_gaussian(self) -> int:
         # activations per Gaussian of space-time grids or networks
+        if isinstance(self.deform, Gaussians4DField):
+            return 200 + 20 * self.deform.predictor_width
         return 200 if isinstance(self.deform, (ControlNodesField, *TIMED_FIELDS)) else 2000
