@@ -51,7 +51,7 @@ def add_parser(commands: args.Commands) -> None:
     parser.add_argument("--max-loss", type=_decibels, metavar="DB", help=about)
     about = "remove this fraction of the Gaussians, in [0, 1), without a search"
     parser.add_argument("--prune", metavar="R", help=about)
-    scores = ("variation", "sensitivity", "contribution")
+    scores = ("sensitivity", "contribution", "temporal", "variation")
     parser.add_argument(
         "--score", choices=scores, help="importance score of a Gaussian (default sensitivity)"
     )

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from dyngs.compress.search import held_out_indices, validation_images
-from dyngs.compress.stage import mean_psnr, measure_importance, scoring_views
+from dyngs.compress.stage import mean_psnr, measure_contributions, scoring_views
 from dyngs.config import Config
 from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError, format_count
@@ -238,13 +238,14 @@ def find_removal_candidates(trainer: GaussianTrainer, held: Sequence[int]) -> di
     views = scoring_views(trainer, scene)
     if scene.is_static:
         cameras = trainer.images.cameras()
-        views = replace(views, cameras=[cameras[i] for i in range(len(cameras)) if i not in held])
-    found = measure_importance(views, slopes=False)
-    contribution = found.contribution
+        unheld = [cameras[i] for i in range(len(cameras)) if i not in held]
+        views = replace(views, cameras=[(None, unheld)])
+    contribution = measure_contributions(views).sum(0)
     kinds = {"never seen": contribution <= 0}
     if scene.is_static and len(trainer.images) >= FEWEST_VIEWS:
         kinds["floaters"] = find_floaters(trainer)
-    shapes = classify_shapes(scene.at(None), found.opacities.amax(0))
+    opacities = torch.stack([scene.at(time).opacities for time, _ in views.cameras])
+    shapes = classify_shapes(scene.at(None), opacities.amax(0))
     kinds |= {kind: shapes[kind] for kind in ("lone", "faint", "veils", "needles")}
     order = torch.sort(contribution, stable=True).indices
     return {kind: order[is_one[order]] for kind, is_one in kinds.items()}

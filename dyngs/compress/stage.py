@@ -17,6 +17,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import softplus
 
 from dyngs.config import PruneConfig
 from dyngs.core.camera import Cameras
@@ -36,94 +37,84 @@ from dyngs.training.loop import Loop
 from dyngs.training.new_trainer import GaussianTrainer
 from dyngs.training.trainer import Trainer, TrainingEdit
 
-# Slope of the hyperbolic tangent: second differences of a profile are small numbers
-STEEPNESS = 4.0
-VOLUME_POWER = 0.1
+VOLUME_POWER = 0.1  # of 4DGS-1K and LightGaussian
+# At most so many training images are scored: all images at evenly chosen training times
+MOST_SCORED_IMAGES = 400
 
 
 @dataclass(frozen=True)
 class ScoringViews:
-    """A scene, and the views that its Gaussians are scored on: every camera at every time."""
+    """A scene, and the cameras at each time that its Gaussians are scored on."""
 
     scene: GaussianScene
-    cameras: Sequence[Cameras]
-    times: Sequence[float | None]
+    cameras: Sequence[tuple[float | None, Sequence[Cameras]]]
     options: RenderOptions
     background: Tensor
 
 
-@dataclass(frozen=True)
-class Importance:
-    """Contributions C (K, N) of N Gaussians at K moments: sums over pixels and views, in one of
-    several ways."""
-
-    fractions: Tensor
-    slopes: Tensor | None
-    opacities: Tensor
-    log_volumes: Tensor
-
-    @property
-    def contribution(self) -> Tensor:
-        return self.fractions.sum(0)
-
-    @property
-    def variation(self) -> Tensor:
-        """(N,) sum_k gamma(k) g(k) C(k), the spatio-temporal variation score of 4DGS-1K (Yuan et
-        al. 2025) for a canonical form that moves.
-
-        gamma(k) = V(k)^0.1 with the volume V, over that of the mean Gaussian; g(k) = 1 / (tanh(4
-        |d(k)|) / 2 + 1/2) in (1, 2] with the second difference d of the profile p over moments.
-        p is the opacity over its maximum where it
-        changes, and otherwise what is seen, C, smoothed by [1 2 1] / 4, over its maximum.
-        """
-        volumes = (VOLUME_POWER * (self.log_volumes - self.log_volumes.mean())).exp()
-        profile = self.opacities
-        if not bool((profile != profile[:1]).any()):
-            before, after = _neighbours(self.fractions)
-            profile = (before + 2 * self.fractions + after) / 4
-        profile = profile / profile.amax(0).clamp_min(torch.finfo(profile.dtype).tiny)
-        before, after = _neighbours(profile)
-        bend = after - 2 * profile + before
-        variation = 1 / (0.5 * torch.tanh(STEEPNESS * bend.abs()) + 0.5)
-        return (volumes * variation * self.fractions).sum(0)
-
-
-def _neighbours(x: Tensor) -> tuple[Tensor, Tensor]:
-    """Return (K, N) the rows before and after those of ``x`` (K, N), ends repeated."""
-    return torch.cat([x[:1], x[:-1]]), torch.cat([x[1:], x[-1:]])
+@torch.no_grad()
+def measure_contributions(views: ScoringViews) -> Tensor:
+    """Return the blending weights (K, N) of N Gaussians, summed over pixels and cameras at each of
+    K times."""
+    rows = []
+    for time, cameras in views.cameras:
+        now = views.scene.time_step(time).gaussians
+        sums = [contributions(now, camera, views.options)[0] for camera in cameras]
+        rows.append(torch.stack(sums).sum(0))
+    return torch.stack(rows)
 
 
 @torch.no_grad()
-def measure_importance(views: ScoringViews, *, slopes: bool) -> Importance:
-    """Return the contribution of each Gaussian to the images of ``views``; ``slopes`` cost the
-    larger half."""
+def measure_sensitivities(views: ScoringViews) -> Tensor:
+    """Return ``sensitivities`` (N,), summed over all views."""
     scene = views.scene
-    options = views.options
-    behind = views.background
-    fractions = []
-    opacities = []
-    volumes = []
-    squares = torch.zeros((), device=behind.device)
-    for time in views.times:
+    total = torch.zeros((), device=views.background.device)
+    for time, cameras in views.cameras:
         moment = scene.time_step(time)
-        now = moment.gaussians
-        sums = [contributions(now, camera, options)[0] for camera in views.cameras]
-        fractions.append(torch.stack(sums).sum(0))
-        opacities.append(now.opacities)
-        volumes.append(now.log_scales.sum(1))
-        if slopes:
-            shader = scene.shader(moment)
-            for camera in views.cameras:
-                squares = (
-                    squares
-                    + sensitivities(now, camera, options, background=behind, shader=shader)[0]
-                )
-    return Importance(
-        torch.stack(fractions),
-        squares if slopes else None,
-        torch.stack(opacities),
-        torch.stack(volumes),
-    )
+        shader = scene.shader(moment)
+        for camera in cameras:
+            slopes = sensitivities(
+                moment.gaussians,
+                camera,
+                views.options,
+                background=views.background,
+                shader=shader,
+            )
+            total = total + slopes[0]
+    return total
+
+
+@torch.no_grad()
+def log_temporal_scores(
+    scene: GaussianScene, clip_length: float = 1.0, *, signed: bool = False
+) -> Tensor:
+    """Return the logarithms (N,) of the temporal scores of 4DGS-1K (Yuan et al. 2025), float64.
+
+    A score is V^0.1 sum_t 1 / (0.5 tanh(x(t)) + 0.5) over all training times. V is the 4D volume.
+    x is the second derivative of the opacity by time, or its magnitude unless ``signed``; it is 0
+    where the opacity does not change. The sum is 1 + exp(-2 x) per time, added as logarithms.
+
+    Args:
+        clip_length: in the unit of time of the derivative; it matters, because tanh saturates.
+    """
+    log_volumes = scene.gaussians.log_scales.double().sum(1)
+    num_times = max(len(scene.times), 1)
+    log_sums = torch.full_like(log_volumes, math.log(2 * num_times))
+    moved = field_scene_of(scene)
+    if moved is not None and moved.field is not None:
+        moving = moved.gaussians.select(moved.moving)
+        total: Tensor | None = None
+        for time in moved.times:
+            window = moved.field.opacity_window(moving, time)
+            if window is None:
+                break
+            x = window.curvature / clip_length**2
+            term = softplus(-2 * (x if signed else x.abs()))
+            total = term if total is None else torch.logaddexp(total, term)
+            log_volumes[moved.moving] = moving.log_scales.double().sum(1) + window.log_spans
+        if total is not None:
+            log_sums[moved.moving] = total
+    return log_sums + VOLUME_POWER * log_volumes
 
 
 def select_highest(scores: Tensor, fraction: float) -> Tensor:
@@ -137,6 +128,7 @@ def select_highest(scores: Tensor, fraction: float) -> Tensor:
 
 # Numbers of training cameras and times whose pairs are scored in dynamic scenes
 MOVING_VIEWS, MOVING_TIMES = 8, 24
+# Most training cameras of a static scene that are scored, and from which masks are computed
 STILL_VIEWS = 100
 PROBED_VIEWS = 16  # Number of training images on which the loss is measured
 MASKED_BELOW = 0.5
@@ -200,16 +192,20 @@ def build_removal_edit(trainer: GaussianTrainer, scores: Tensor | None) -> Train
 
 @torch.no_grad()
 def importance_scores(trainer: GaussianTrainer, options: PruneConfig | None = None) -> Tensor:
-    """Return (N,) how much each Gaussian matters now, by the score of ``options``; None: the first
-    of docs/guides/smaller-and-faster.md."""
-    score = (options or PruneConfig()).score
+    """Return (N,) how much each Gaussian matters, by the score of ``options``, in any unit.
+
+    Docs: docs/concepts/motion.md.
+    """
+    options = options or PruneConfig()
     scene = trainer.model.scene.without_masks()
-    found = measure_importance(scoring_views(trainer, scene), slopes=score == "sensitivity")
-    match score:
-        case "variation":
-            return found.variation
-        case "contribution" | "sensitivity":
-            return found.contribution if found.slopes is None else found.slopes
+    if options.score == "sensitivity":
+        return measure_sensitivities(scoring_views(trainer, scene))
+    clip_length = trainer.capture.seconds or 1.0
+    temporal = log_temporal_scores(scene, clip_length, signed=options.signed)
+    if options.score == "temporal":
+        return temporal
+    contribution = measure_contributions(training_views(trainer, scene)).sum(0)
+    return contribution if options.score == "contribution" else contribution.log() + temporal
 
 
 def distinct_cameras(cameras: Sequence[Cameras], count: int) -> list[Cameras]:
@@ -224,20 +220,31 @@ def distinct_cameras(cameras: Sequence[Cameras], count: int) -> list[Cameras]:
 
 
 def scoring_views(
-    trainer: GaussianTrainer, scene: GaussianScene, times: Sequence[float | None] | None = None
+    trainer: GaussianTrainer,
+    scene: GaussianScene,
+    times: Sequence[float] | None = None,
+    most: int = MOVING_VIEWS,
 ) -> ScoringViews:
-    """Return all pairs of some training cameras and some times; with no times all that matters are
-    cameras."""
-    background = background_colour(trainer.background)
+    """Return all pairs of ``most`` training cameras and ``times``; None: some training times."""
     if times is None:
-        times = (
-            [None]
-            if scene.is_static
-            else [scene.times[i] for i in evenly_spaced(len(scene.times), MOVING_TIMES)]
-        )
-    views = STILL_VIEWS if scene.is_static else MOVING_VIEWS
-    cameras = distinct_cameras(trainer.images.cameras(), views)
-    return ScoringViews(scene, cameras, times, trainer.model.options, background)
+        times = [scene.times[i] for i in evenly_spaced(len(scene.times), MOVING_TIMES)]
+    cameras = distinct_cameras(trainer.images.cameras(), STILL_VIEWS if scene.is_static else most)
+    groups = [(None, cameras)] if scene.is_static else [(time, cameras) for time in times]
+    return ScoringViews(scene, groups, trainer.model.options, background_colour(trainer.background))
+
+
+def training_views(trainer: GaussianTrainer, scene: GaussianScene) -> ScoringViews:
+    """Return the training views; of many, all at evenly chosen times."""
+    views = scoring_views(trainer, scene, [])
+    if scene.is_static:
+        return views
+    groups: dict[float, list[Cameras]] = {}
+    for time, camera in zip(trainer.images.times, trainer.images.cameras(), strict=True):
+        groups.setdefault(time or 0.0, []).append(camera)
+    times = sorted(groups)
+    count = max(MOST_SCORED_IMAGES * len(times) // len(trainer.images), 1)
+    chosen = [times[i] for i in evenly_spaced(len(times), count)]
+    return replace(views, cameras=[(time, groups[time]) for time in chosen])
 
 
 def probe_images(trainer: Trainer[Any]) -> list[Image]:
@@ -268,16 +275,16 @@ def mean_psnr(
 
 
 def _masks(trainer: GaussianTrainer, scene: GaussianScene, kept: Tensor | None) -> VisibilityMasks:
-    """Return at which of evenly spaced key times each Gaussian kept is seen from any of the
-    survey's cameras."""
+    """Return which of the Gaussians ``kept`` are visible from any training camera at evenly spaced
+    key times, or around them."""
     options = trainer.config.prune
     last = len(scene.times) - 1
     count = min(options.mask_times, len(scene.times))
     times = [scene.times[round(k * last / (count - 1))] for k in range(count)]
-    fractions = measure_importance(scoring_views(trainer, scene, times), slopes=False).fractions
-    seen = fractions > MASKED_BELOW
+    seen = measure_contributions(scoring_views(trainer, scene, times, STILL_VIEWS)) > MASKED_BELOW
     moved = field_scene_of(scene)
-    if moved is not None and moved.field is not None and moved.field.can_fade:
+    can_fade = moved is not None and moved.field is not None and moved.field.can_fade
+    if options.mask_between and can_fade:
         seen |= visible_between_times(scene, times, trainer.model.options.alpha_min).to(seen.device)
     return VisibilityMasks.pack(tuple(times), seen if kept is None else seen[:, kept])
 

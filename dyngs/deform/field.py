@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+from torch.nn.functional import logsigmoid
 
 from dyngs.core.initialisation import glorot
 from dyngs.core.state import State, add_prefix, move_to_device, select_prefix
@@ -84,6 +85,27 @@ class DeformedGaussians:
     penalties: dict[str, Tensor] = dataclass_field(default_factory=dict[str, Tensor])
 
 
+@dataclass(frozen=True)
+class OpacityWindow:
+    """Opacities of M moving Gaussians over time, in closed form; float64."""
+
+    # (M,) second derivative at a time, per squared clip, of the opacity over that of an open window
+    curvature: Tensor
+    log_spans: Tensor  # (M,) logarithms of the lifetimes, in clips
+
+
+def logit_curvature(logits: Tensor, window: Tensor) -> Tensor:
+    """Return the second derivative (M,) of sigmoid(L + w) / sigmoid(L), for ``OpacityWindow``.
+
+    ``logits`` (M,) are L; ``window`` (3, M) is w with its first and second derivative.
+    """
+    value, slope, bend = window
+    logits = logits.double()
+    opacity = (logits + value).sigmoid()
+    relative = (logsigmoid(logits + value) - logsigmoid(logits)).exp()
+    return relative * (1 - opacity) * (bend + (1 - 2 * opacity) * slope.square())
+
+
 class DeformationField:
     """Motion of canonical Gaussians over time; most fields compute offsets.
 
@@ -99,6 +121,8 @@ class DeformationField:
     """Opacities may fade in or out, so that a Gaussian exists for a part of the clip."""
     can_freeze = True
     """Moving Gaussians become static where their motion is too small to be visible."""
+    depends_on_view = False
+    """Motion differs between cameras."""
 
     @property
     def num_values(self) -> int:
@@ -123,9 +147,18 @@ class DeformationField:
         raise NotImplementedError
 
     def deform(
-        self, gaussians: Gaussians, moving: MovingRows, time: float, *, in_training: bool = False
+        self,
+        gaussians: Gaussians,
+        moving: MovingRows,
+        time: float,
+        *,
+        in_training: bool = False,
+        eye: Tensor | None = None,
     ) -> DeformedGaussians:
-        """Return ``gaussians`` (A) with the moving ones at ``time``; in training with penalties."""
+        """Return ``gaussians`` (A) with the moving ones at ``time``; in training with penalties.
+
+        ``eye``: (3,) camera centre, if the field depends on the view; None: no camera.
+        """
         penalties: dict[str, Tensor] = {}
         if in_training and moving.visible is None:
             offsets, penalties = self.in_training(moving.means, time)
@@ -133,6 +166,16 @@ class DeformationField:
             offsets = self.offsets(moving.means, time, moving.visible)
             penalties = self.penalties(time) if in_training else {}
         return DeformedGaussians(apply_offsets(gaussians, offsets, moving.rows), offsets, penalties)
+
+    def opacity_window(self, gaussians: Gaussians, time: float) -> OpacityWindow | None:
+        """Return the opacities of the moving ``gaussians`` (M) around ``time``, in closed form;
+        None: opacities do not change, or have no closed form."""
+        return None
+
+    def lifetimes(self, gaussians: Gaussians) -> Tensor | None:
+        """Return the first and the last time (M, 2) at which each of the moving ``gaussians`` is
+        drawn; None: any time."""
+        return None
 
     def penalties(self, time: float) -> dict[str, Tensor]:
         """Return weighted regularisation terms of the field by name; some depend on ``time``."""
@@ -216,6 +259,9 @@ class OuterField(DeformationField):
 
     def step(self, step: int, progress: float) -> Count:
         return self.parameters.step(step, progress) + self.inner_field.step(step, progress)
+
+    def opacity_window(self, gaussians: Gaussians, time: float) -> OpacityWindow | None:
+        return self.inner_field.opacity_window(gaussians, time)
 
     def penalties(self, time: float) -> dict[str, Tensor]:
         return self.inner_field.penalties(time)

@@ -15,7 +15,14 @@ import torch
 from torch import Tensor
 
 from dyngs.core.state import Role
-from dyngs.deform.field import DeformationField, FieldSetup, Offsets, select_rows
+from dyngs.deform.field import (
+    DeformationField,
+    FieldSetup,
+    Offsets,
+    OpacityWindow,
+    logit_curvature,
+    select_rows,
+)
 from dyngs.deform.fixed_cameras.initial_motion import TimedGaussians
 from dyngs.deform.keys import COPIES_OF_MOVING, FreeField
 from dyngs.gaussians import Gaussians, TopologyEdit
@@ -66,6 +73,12 @@ class FreePrimitives(DeformationField):
         spans = log_spans.exp() + MIN_SPAN * self.gap
         window = -0.5 * ((time - centers) / spans).square()
         return Offsets(shift, logit_opacities=window[:, 0])
+
+    def opacity_window(self, gaussians: Gaussians, time: float) -> OpacityWindow:
+        spans = self.parameters["log_spans"].detach()[:, 0].double().exp() + MIN_SPAN * self.gap
+        elapsed = (time - self.parameters["centers"].detach()[:, 0].double()) / spans
+        window = torch.stack([-0.5 * elapsed.square(), -elapsed / spans, -spans.pow(-2)])
+        return OpacityWindow(logit_curvature(gaussians.logit_opacities, window), spans.log())
 
     def apply_edit(self, edit: TopologyEdit) -> FreePrimitives:
         """Return the field after a topology edit; new rows are shifted in time, alternately back

@@ -383,7 +383,7 @@ def _timed_render(
         device = scene.device
         synchronize(device)
         start = time.perf_counter()
-        moment = scene.time_step(image.time)
+        moment = scene.drawing_step(image.time)
         synchronize(device)
         apply_offsets = time.perf_counter()
         rendering = scene.render(image.cameras, moment, options=options, background=background)

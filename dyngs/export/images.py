@@ -90,7 +90,7 @@ def render_path(
         time = None if path.times is None or scene.is_static else path.times[i]
         if time_step is None or time != step_time:
             with torch.no_grad():
-                time_step = scene.time_step(time)
+                time_step = scene.drawing_step(time)
             step_time = time
         yield render_frame(scene, path.cameras.select(i), time_step, options)
 

@@ -42,8 +42,12 @@ class VisibilityMasks:
 
     def active(self, interval: int) -> Tensor:
         """Return ascending indices (A,) of the Gaussians visible at either end of an interval."""
+        return torch.nonzero(self.visible(interval))[:, 0]
+
+    def visible(self, interval: int) -> Tensor:
+        """Return (N,) bool: which Gaussians are visible at either end of an interval."""
         either = self.bits[interval] | self.bits[interval + 1]
-        return torch.nonzero(_unpacked(either[None], self.count)[0])[:, 0]
+        return _unpacked(either[None], self.count)[0]
 
     def select(self, index: Tensor) -> VisibilityMasks:
         return VisibilityMasks.pack(self.times, self.seen[:, index])

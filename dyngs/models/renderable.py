@@ -258,6 +258,10 @@ class Renderable(ABC):
         """Return what drawing at ``time`` needs, clamped to [0, 1]; None is the first."""
         return TimeStep(clamp_time(time))
 
+    def drawing_step(self, time: float | None) -> TimeStep:
+        """Return ``time_step``, or an equivalent one without what is invisible at ``time``."""
+        return self.time_step(time)
+
     @abstractmethod
     def state(self) -> State:
         """Return everything that is stored, by name, with its role."""

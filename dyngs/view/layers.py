@@ -177,7 +177,7 @@ def _rendering(opened: OpenedScene, request: ViewRequest, **options: Any) -> Ren
         scene = opened.once(part, lambda: opened.scene.part(part))
     kept: dict[str, tuple[float | None, TimeStep]] = opened.once("time steps", dict)
     if part not in kept or kept[part][0] != request.time:
-        kept[part] = request.time, scene.time_step(request.time)
+        kept[part] = request.time, scene.drawing_step(request.time)
     how = replace(scene.options, **options)
     behind = request.behind(opened)
     rendering = scene.render(request.camera, kept[part][1], options=how, background=behind)

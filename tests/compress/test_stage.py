@@ -3,7 +3,6 @@ masks."""
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import pytest
@@ -12,11 +11,7 @@ from tiny_fields import ALL_KINDS, busy_config, cloud, tiny_setup
 from torch import Tensor
 
 from dyngs.api.train import train
-from dyngs.compress.stage import (
-    Importance,
-    build_pruning_edit,
-    visible_between_times,
-)
+from dyngs.compress.stage import build_pruning_edit, visible_between_times
 from dyngs.config import (
     Config,
     DataConfig,
@@ -123,7 +118,7 @@ def test_mcmc_stands_still_in_the_stage(still: Path, tmp_path: Path) -> None:
     assert len(trainer.model.scene.gaussians) == before - before // 2
 
 
-@pytest.mark.parametrize("score", ["variation", "sensitivity", "contribution"])
+@pytest.mark.parametrize("score", ["sensitivity", "contribution", "temporal", "variation"])
 def test_every_score_keeps_as_many(score: str, moving: Path, tmp_path: Path) -> None:
     stage = STAGE.model_copy(update={"score": score})
     trainer = trained(moving_config(moving, tmp_path, "control_nodes", stage))
@@ -154,25 +149,6 @@ def test_masks_are_trained_with(moving: Path, tmp_path: Path) -> None:
     grad = trainer.model.scene.gaussians.means.grad
     assert grad is not None
     assert torch.equal(torch.nonzero(grad.any(1))[:, 0], active)
-
-
-def constant(
-    fractions: list[list[float]], opacities: list[list[float]] | None = None
-) -> Importance:
-    """K moments of N Gaussians of one size."""
-    c = torch.tensor(fractions)
-    o = torch.full_like(c, 0.5) if opacities is None else torch.tensor(opacities)
-    return Importance(c, None, o, torch.zeros_like(c))
-
-
-def test_opacity_that_changes_is_the_profile() -> None:
-    """1 / (tanh(4 |d|) / 2 + 1/2) by hand: p = (1, 0, 1), d = (-1, 2, -1) with repeated ends."""
-    found = constant([[1.0, 1.0]] * 3, [[0.8, 0.5], [0.0, 0.5], [0.8, 0.5]])
-    g = [2 / (math.tanh(4 * d) + 1) for d in (1.0, 2.0, 1.0)]
-    torch.testing.assert_close(found.variation, torch.tensor([sum(g), 6.0]))
-    volumes = torch.tensor([[0.0, 3.0]])  # the tenth power: e^3 times the volume
-    found = Importance(torch.ones(1, 2), None, torch.ones(1, 2), volumes)
-    assert float(found.variation[1] / found.variation[0]) == pytest.approx(math.exp(0.3))
 
 
 def test_what_is_there_for_a_while_is_masked_only_while_it_is_not() -> None:

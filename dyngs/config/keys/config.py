@@ -56,15 +56,26 @@ class PruneConfig(Section):
     fraction: float = Field(
         default=0.0, ge=0, lt=1, description="fraction of the Gaussians to remove; 0: none"
     )
-    score: Literal["variation", "sensitivity", "contribution"] = Field(
+    score: Literal["sensitivity", "contribution", "temporal", "variation"] = Field(
         default="sensitivity",
-        description="importance score; the Gaussians with the lowest scores are removed",
+        description="importance score (`dyngs docs motion`); the Gaussians with the lowest scores "
+        "are removed",
+    )
+    signed: bool = Field(
+        default=False,
+        description="whether `temporal` and `variation` use the second derivative of the opacity "
+        "with its sign; false: its magnitude",
     )
     mask_times: int = Field(
         default=0,
         ge=0,
         description="number of key times of the visibility masks (4DGS-1K), which skip Gaussians "
         "that hardly contribute at a time; 0 or 1: no masks",
+    )
+    mask_between: bool = Field(
+        default=True,
+        description="whether masks keep Gaussians that are visible only between key times; false: "
+        "as in 4DGS-1K",
     )
     steps: int = Field(default=2000, ge=1, description="number of fine-tuning steps after pruning")
 
