@@ -22,6 +22,7 @@ import argparse
 import json
 import os
 import shutil
+import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
@@ -100,6 +101,14 @@ class Row:
     def result(self) -> Path:
         return self.folder / f"{self.name}.json"
 
+    def is_stored(self) -> bool:
+        """Return whether the row has a result; exit if it was trained with other overrides."""
+        if not self.result.is_file():
+            return False
+        if json.loads(self.result.read_text(encoding="utf-8"))["overrides"] != [*self.overrides]:
+            sys.exit(f"{self.result}: trained with other overrides; use another FOLDER")
+        return True
+
 
 def run_row(row: Row) -> None:
     """Prune, fine-tune, evaluate and store a row."""
@@ -113,6 +122,7 @@ def run_row(row: Row) -> None:
         "score": row.score,
         "fraction": row.fraction,
         "masks": row.masks,
+        "overrides": [*row.overrides],
         "stored_mb": 1e-6 * file.stat().st_size,
         **quality(row.out),
         "seconds": time.perf_counter() - started,
@@ -136,10 +146,15 @@ def quality(run_dir: Path) -> dict[str, Any]:
 
 def print_speeds(run_dir: Path, folder: Path) -> None:
     """Time all stored rows alternately, and print the table."""
-    paths = sorted(folder.glob("*.json"))
-    rows = [json.loads(path.read_text(encoding="utf-8")) for path in paths]
+    rows = [json.loads(path.read_text(encoding="utf-8")) for path in folder.glob("*.json")]
+    orders = list(SCORES), list(MASKS)
+    rows.sort(
+        key=lambda x: (orders[0].index(x["score"]), x["fraction"], orders[1].index(x["masks"]))
+    )
+    names = [f"{row['score']}_{row['fraction']:g}_{row['masks']}" for row in rows]
+    folders = [run_dir, *(folder / name for name in names)]
     trained = {"score": "not pruned", "fraction": 0.0, "masks": "none", **quality(run_dir)}
-    models = [open_model(run_dir), *(open_model(path.with_suffix("")) for path in paths)]
+    models = [open_model(path) for path in folders]
     images = models[0].held_out
     views = []
     for i in evenly_spaced(len(images), 8):
@@ -167,7 +182,7 @@ def run_rows(given: argparse.Namespace) -> None:
     os.environ["OMP_NUM_THREADS"] = "1"
     chosen = product(given.scores, given.fractions, given.masks)
     rows = [Row(given.run_dir, given.folder, *x, tuple(given.overrides)) for x in chosen]
-    missing = [row for row in rows if not row.result.is_file()]
+    missing = [row for row in rows if not row.is_stored()]
     print(f"{len(missing)} of {len(rows)} rows", flush=True)
     with ProcessPoolExecutor(given.jobs, get_context("spawn")) as pool:
         list(pool.map(run_row, missing))
