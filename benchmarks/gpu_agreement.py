@@ -33,6 +33,7 @@ from dyngs.ops.posing import pose_by_joints
 from dyngs.ops.quaternions import rotation_matrices
 from dyngs.ops.rays import Samples, composite
 from dyngs.ops.skinning import blend_skinning
+from dyngs.ops.slicing import slice_gaussians
 
 COUNT, SIDE = 3000, 96
 Given = dict[str, Tensor]
@@ -121,6 +122,13 @@ def posed(given: Given) -> Found:
     return with_gradients(given, {"means": made.means, "covariances": axes @ axes.mT})
 
 
+def sliced(given: Given) -> Found:
+    """4D Gaussians at a time; axes as in ``posed``."""
+    means, quats, log_scales, logits = slice_gaussians(**given, time=0.3, min_weight=0)
+    axes = rotation_matrices(quats) * log_scales.exp()[:, None, :]
+    return with_gradients(given, {"means": means, "covariances": axes @ axes.mT, "logits": logits})
+
+
 def decoded(given: Given) -> Found:
     """A network whose third layer sees the features once more."""
     layers = [Layer(given[f"weight{i}"], given[f"bias{i}"]) for i in range(4)]
@@ -205,6 +213,18 @@ def cases() -> dict[str, tuple[Callable[[Given], Found], Given]]:
                 "log_scales": trained(numbers(COUNT, 3, seed=2, scale=0.5)),
                 "weights": (4 * numbers(COUNT, 24, seed=3)).softmax(1),
                 "transforms": trained(transforms),
+            },
+        ),
+        "4D Gaussians": (
+            sliced,
+            {
+                "means": trained(numbers(COUNT, 3)),
+                "times": trained(numbers(COUNT, seed=1)),
+                "quats": trained(numbers(COUNT, 4, seed=2)),
+                "right_quats": trained(numbers(COUNT, 4, seed=3)),
+                "log_scales": trained(numbers(COUNT, 3, seed=4, scale=0.5)),
+                "log_spans": trained(numbers(COUNT, seed=5, scale=0.5)),
+                "logit_opacities": trained(numbers(COUNT, seed=6)),
             },
         ),
         "network": (decoded, network()),

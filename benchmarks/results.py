@@ -108,14 +108,8 @@ MEASUREMENTS = {
     "lego400_bg_triangle": Measurement(
         "systems", "lego", "lego400", "bg_triangle", ("data.longest_side=200",)
     ),
-    "orbits_hexplane": Measurement(
-        "systems", "orbits", "orbits", "dynamic",
-        ("model.pilot_runs=false", "model.deform.kind=hexplane"),
-    ),
-    "orbits_mlp": Measurement(
-        "systems", "orbits", "orbits", "dynamic",
-        ("model.pilot_runs=false", "model.deform.kind=mlp"),
-    ),
+    "orbits_4dgs": Measurement("systems", "orbits", "orbits", "4dgs"),
+    "orbits_deformable_3dgs": Measurement("systems", "orbits", "orbits", "deformable_3dgs"),
     "orbits_gaussians_4d": Measurement("systems", "orbits", "orbits", "gaussians_4d"),
     "stage_free": Measurement(
         "systems", "stage", "stage", "dynamic",
@@ -417,32 +411,53 @@ def comparison_table(found: Sequence[Mapping[str, Any]]) -> str:
 SOURCES = {"code": "", "paper": "", "second": " (second hand)", "unverified": " (unverified)"}
 
 
+@dataclass(frozen=True)
+class OwnFigure:
+    """A stored figure of a system."""
+
+    figure: str
+    protocol: str
+    commit: str
+    command: str
+
+
 def own_figures(
     system: Mapping[str, Any], results: Mapping[str, Result], moving: Sequence[Mapping[str, Any]]
-) -> tuple[list[str], list[str], list[str]]:
-    """Return figures, protocols and commits of the stored results of a system."""
-    figures = []
-    protocols = []
-    commits = []
+) -> list[OwnFigure]:
+    """Return the figures of a system from its measurements and the comparison ``moving``."""
+    found = []
     for name in system.get("measurements", ()):
         if name in results:
             result = results[name]
-            figures.append(f"{Path(result.capture).name} {psnr_cell(result)}")
-            protocols.append(f"{result.image_size}, {result.steps:,} steps")
-            commits.append(result.commit)
-    for (capture, variant), seeds in group_rows(moving).items():
-        measured = [row for row in seeds if "refused" not in row]
-        if variant == system.get("variant") and measured:
-            figures.append(f"{capture} {spread_cell([row['psnr'] for row in measured], '.2f')}")
-            protocols.append(f"{measured[0]['minutes']:g} minutes, one thread")
-            commits += [row["commit"] for row in measured]
-    return figures, protocols, commits
+            figure = f"{Path(result.capture).name} {psnr_cell(result)}"
+            protocol = f"{result.image_size}, {result.steps:,} steps"
+            found.append(OwnFigure(figure, protocol, result.commit, result.command))
+    measured_rows = [row for row in moving if "refused" not in row]
+    stored = {row["variant"] for row in measured_rows}
+    # The first variant that is stored
+    wanted = next((name for name in system.get("variants", ()) if name in stored), None)
+    for (capture, variant), seeds in group_rows(measured_rows).items():
+        if variant == wanted:
+            figure = f"{capture} {spread_cell([row['psnr'] for row in seeds], '.2f')}"
+            protocol = f"{seeds[0]['minutes']:g} minutes, one thread"
+            found.append(OwnFigure(figure, protocol, seeds[0]["commit"], seeds[0]["command"]))
+    return found
 
 
-def systems_page(results: Mapping[str, Result]) -> str:
+def unmeasured_commands(system: Mapping[str, Any]) -> list[str]:
+    """Return the commands that train a system without stored figures."""
+    commands = []
+    for name in system.get("measurements", ()):
+        measurement = MEASUREMENTS[name]
+        place = Path(measurement.capture).name
+        words = training_command(measurement, place, f"runs/{name}", threads=1)
+        commands.append(" ".join(["dyngs", *words]))
+    return commands + ([system["command"]] if "command" in system else [])
+
+
+def systems_page(results: Mapping[str, Result], moving: Sequence[Mapping[str, Any]]) -> str:
     """The page with a row per system: published figure, own figure, command and commit."""
     systems = yaml.safe_load(PUBLISHED.read_text(encoding="utf-8"))
-    moving = json.loads(MOVING.read_text(encoding="utf-8")) if MOVING.is_file() else []
     head = ["system", "published", "data, protocol", "ours, PSNR in dB", "protocol", "differs"]
     rows = [[*head, "commit"]]
     commands = []
@@ -451,26 +466,20 @@ def systems_page(results: Mapping[str, Result]) -> str:
         if "arxiv" in system:
             link = f"https://arxiv.org/abs/{system['arxiv']}"
             title = f"[{system['system']}]({link}), {system['paper']}"
-        figures, protocols, commits = own_figures(system, results, moving)
+        own = own_figures(system, results, moving)
         rows.append(
             [
                 title,
                 system["published"] + SOURCES[system["checked"]],
                 system["protocol"],
-                "; ".join(figures) or "not measured",
-                "; ".join(dict.fromkeys(protocols)),
+                "; ".join(x.figure for x in own) or "not measured",
+                "; ".join(dict.fromkeys(x.protocol for x in own)),
                 system["differs"],
-                ", ".join(dict.fromkeys(commits)),
+                ", ".join(dict.fromkeys(x.commit for x in own)),
             ]
         )
         commands.append(f"# {system['system']}")
-        for name in system.get("measurements", ()):
-            measurement = MEASUREMENTS[name]
-            place = Path(measurement.capture).name
-            words = ["dyngs", *training_command(measurement, place, f"runs/{name}", threads=1)]
-            commands.append(results[name].command if name in results else " ".join(words))
-        if "command" in system:
-            commands.append(system["command"])
+        commands += [x.command for x in own] or unmeasured_commands(system)
     text = (
         "# Results beside published figures\n\n"
         "Every system that dyngs trains, with the figure of its paper and ours. The data sets of the\n"
@@ -491,7 +500,8 @@ def written_pages(results: dict[str, Result]) -> dict[Path, str]:
     """Return the contents of all pages, and of README.md with its new table."""
     pages = {PAGES / f"{page}.md": quality_page(page, results) for page in DETAILS}
     pages[PAGES / "size.md"] = size_page(results)
-    pages[ROOT / "docs/results.md"] = systems_page(results)
+    moving = json.loads(MOVING.read_text(encoding="utf-8")) if MOVING.is_file() else []
+    pages[ROOT / "docs/results.md"] = systems_page(results, moving)
     readme = ROOT / "README.md"
     before, rest = readme.read_text(encoding="utf-8").split(TABLE_BEGIN)
     after = rest.split(TABLE_END)[1]

@@ -63,14 +63,22 @@ def test_a_comparison_shows_means_spread_and_refusals(results: ModuleType) -> No
 
 
 def test_a_row_for_each_published_system(results: ModuleType) -> None:
-    page = results.systems_page({})
+    page = results.systems_page({}, [])
     assert page.count("| not measured |") == 18
     assert "36.39 dB" in page
-    stored = results.systems_page(results.load_results())
-    assert "lego400 35.64" in stored
+    stored = results.systems_page(results.load_results(), [])
+    assert "| lego400 35.64 | 400x400, 30,000 steps |" in stored
 
 
-@pytest.mark.usefixtures("results")
+def test_a_system_shows_the_compared_variant_nearest_to_its_paper(results: ModuleType) -> None:
+    about = {"capture": "rig", "minutes": 1.5, "commit": "c0ffee00", "command": "dyngs"}
+    rows = [about | {"variant": "hexplane", "psnr": 20.0}, about | {"variant": "mlp", "psnr": 1.0}]
+    system = {"variants": ["4dgs", "hexplane"]}
+    assert [x.figure for x in results.own_figures(system, {}, rows)] == ["rig 20.00"]
+    rows.append(about | {"variant": "4dgs", "psnr": 30.0})
+    assert [x.figure for x in results.own_figures(system, {}, rows)] == ["rig 30.00"]
+
+
 def test_every_compared_variant_is_a_valid_configuration() -> None:
     for name, (preset, *overrides) in load_benchmark("dynamic").VARIANTS.items():
         config = load_config(preset, ["data.root=capture", *overrides])

@@ -7,51 +7,49 @@ namespace {
 
 constexpr const char* kOp = "slicing";
 
-template <class S>
-using Line = Array<S, nb::ndim<1>>;
 // Quaternions, right quaternions, log scales, log spans.
 template <class S>
-using Shapes = std::tuple<Rows<S>, Rows<S>, Rows<S>, Line<S>>;
+using RotationsAndScales = std::tuple<Rows<S>, Rows<S>, Rows<S>, Array<S>>;
 // Means, times, shapes, logits; of gradients likewise.
 template <class S>
-using Inputs = std::tuple<Rows<S>, Line<S>, Shapes<S>, Line<S>>;
+using SpaceTimeArrays = std::tuple<Rows<S>, Array<S>, RotationsAndScales<S>, Array<S>>;
 // Means, quaternions, log scales, logits.
 template <class S>
-using Sliced = std::tuple<Rows<S>, Rows<S>, Rows<S>, Line<S>>;
+using SliceArrays = std::tuple<Rows<S>, Rows<S>, Rows<S>, Array<S>>;
 template <class S>
-using Basis = Array<S, nb::shape<-1, 4, 3>>;
+using SliceBasis = Array<S, nb::shape<-1, 4, 3>>;
 
 template <class S>
-SpaceTimeGaussians<S> shape_input(const Shapes<const S>& arrays) {
+SpaceTimeGaussians<S> shape_input(const RotationsAndScales<const S>& arrays) {
   const auto& [quats, right_quats, log_scales, log_spans] = arrays;
   SpaceTimeGaussians<S> in{};
   in.count = quats.shape(0);
   in.quats = checked(quats, in.count, 4, kOp), in.right_quats = checked(right_quats, in.count, 4, kOp);
   in.log_scales = checked(log_scales, in.count, 3, kOp);
-  in.log_spans = checked(Array<const S>(log_spans), in.count, "slicing: log_spans");
+  in.log_spans = checked(log_spans, in.count, "slicing: log_spans");
   return in;
 }
 
 template <class S>
-SpaceTimeGaussians<S> slicing_input(const Inputs<const S>& arrays) {
+SpaceTimeGaussians<S> slicing_input(const SpaceTimeArrays<const S>& arrays) {
   const auto& [means, times, shapes, logits] = arrays;
   SpaceTimeGaussians<S> in = shape_input<S>(shapes);
   in.means = checked(means, in.count, 3, kOp);
-  in.times = checked(Array<const S>(times), in.count, "slicing: times");
-  in.logit_opacities = checked(Array<const S>(logits), in.count, "slicing: logit_opacities");
+  in.times = checked(times, in.count, "slicing: times");
+  in.logit_opacities = checked(logits, in.count, "slicing: logit_opacities");
   return in;
 }
 
 template <class T>
-Slice<T> slice_arrays(const Sliced<T>& arrays, const Basis<T>& basis, int64_t count) {
+Slice<T> slice_arrays(const SliceArrays<T>& arrays, const SliceBasis<T>& basis, int64_t count) {
   const auto& [means, quats, log_scales, logits] = arrays;
   return {checked(means, count, 3, kOp), checked(quats, count, 4, kOp), checked(log_scales, count, 3, kOp),
-          checked(Array<T>(logits), count, "slicing: logit_opacities"), checked(basis, count, 4, kOp)};
+          checked(logits, count, "slicing: logit_opacities"), checked(basis, count, 4, kOp)};
 }
 
 template <class S>
-void slice_forward_arrays(const Inputs<const S>& inputs, double time, double most_faded, const Sliced<S>& sliced,
-                          const Basis<S>& basis, int threads) {
+void slice_forward_arrays(const SpaceTimeArrays<const S>& inputs, double time, double most_faded,
+                          const SliceArrays<S>& sliced, const SliceBasis<S>& basis, int threads) {
   const SpaceTimeGaussians<S> in = slicing_input<S>(inputs);
   const SliceTime<S> at{static_cast<S>(time), static_cast<S>(most_faded)};
   const Slice<S> out = slice_arrays<S>(sliced, basis, in.count);
@@ -60,8 +58,9 @@ void slice_forward_arrays(const Inputs<const S>& inputs, double time, double mos
 }
 
 template <class S>
-void slice_backward_arrays(const Inputs<const S>& inputs, double time, double most_faded, const Sliced<const S>& sliced,
-                           const Basis<const S>& basis, const Sliced<const S>& g, const Inputs<S>& grads, int threads) {
+void slice_backward_arrays(const SpaceTimeArrays<const S>& inputs, double time, double most_faded,
+                           const SliceArrays<const S>& sliced, const SliceBasis<const S>& basis,
+                           const SliceArrays<const S>& g, const SpaceTimeArrays<S>& grads, int threads) {
   const SpaceTimeGaussians<S> in = slicing_input<S>(inputs);
   const SliceTime<S> at{static_cast<S>(time), static_cast<S>(most_faded)};
   const Slice<const S> slice = slice_arrays<const S>(sliced, basis, in.count);
@@ -69,23 +68,23 @@ void slice_backward_arrays(const Inputs<const S>& inputs, double time, double mo
   const auto& [means, times, shapes, logits] = grads;
   const auto& [quats, right_quats, log_scales, log_spans] = shapes;
   const SpaceTimeGrads<S> out{checked(means, in.count, 3, kOp),
-                              checked(Array<S>(times), in.count, "slicing: times"),
+                              checked(times, in.count, "slicing: times"),
                               checked(quats, in.count, 4, kOp),
                               checked(right_quats, in.count, 4, kOp),
                               checked(log_scales, in.count, 3, kOp),
-                              checked(Array<S>(log_spans), in.count, "slicing: log_spans"),
-                              checked(Array<S>(logits), in.count, "slicing: logit_opacities")};
+                              checked(log_spans, in.count, "slicing: log_spans"),
+                              checked(logits, in.count, "slicing: logit_opacities")};
   nb::gil_scoped_release release;
   slice_backward<S>(in, at, slice, {by.means, by.quats, by.log_scales, by.logit_opacities}, out, threads);
 }
 
 template <class S>
-void condition_arrays(const Shapes<const S>& shapes, const Sliced<S>& outputs, int threads) {
+void condition_arrays(const RotationsAndScales<const S>& shapes, const SliceArrays<S>& outputs, int threads) {
   const SpaceTimeGaussians<S> in = shape_input<S>(shapes);
   const auto& [velocities, quats, log_scales, log_deviations] = outputs;
   const Conditional<S> out{checked(quats, in.count, 4, kOp), checked(log_scales, in.count, 3, kOp),
                            checked(velocities, in.count, 3, kOp),
-                           checked(Array<S>(log_deviations), in.count, "slicing: log_deviations")};
+                           checked(log_deviations, in.count, "slicing: log_deviations")};
   nb::gil_scoped_release release;
   condition(in, out, threads);
 }

@@ -68,15 +68,21 @@ DYNGS_HD SpaceTime<R> space_time(const Quat<R>& left, const Quat<R>& right, cons
   f.right = normalize(right, f.inv_right);
   f.nothing = (left.w + left.x + left.y + left.z) * zero + (right.w + right.x + right.y + right.z) * zero;
   f.longest = max(max(log_scales[0], log_scales[1]), max(log_scales[2], log_scales[3]));
-  const Quat<R>& q = f.left;
-  const Quat<R> turned[4] = {{-q.x, q.w, q.z, -q.y}, {-q.y, -q.z, q.w, q.x}, {-q.z, q.y, -q.x, q.w}, q};
+  // The parts of R that mix space and time, from sums that vanish without rounding where q_r is conjugate to q_l.
+  const Quat<R>&q = f.left, &r = f.right;
+  const Vec3<R> vector{q.x, q.y, q.z}, sum{q.x + r.x, q.y + r.y, q.z + r.z};
+  const Vec3<R> mixed = sum * q.w + vector * (r.w - q.w), turned = cross(vector, sum);
+  const Vec3<R> to_time = turned - mixed, from_time = turned + mixed;
+  const Quat<R> x = Quat<R>{-q.x, q.w, q.z, -q.y} * r, y = Quat<R>{-q.y, -q.z, q.w, q.x} * r;
+  const Quat<R> z = Quat<R>{-q.z, q.y, -q.x, q.w} * r;
+  const Vec3<R> space[4] = {{x.x, x.y, x.z}, {y.x, y.y, y.z}, {z.x, z.y, z.z}, from_time};
+  const R time[4] = {to_time.x, to_time.y, to_time.z, q.w * r.w - q.x * r.x - q.y * r.y - q.z * r.z};
   f.largest = zero;
   for (int k = 0; k < 4; ++k) {
     f.nothing = f.nothing + log_scales[k] * zero;
-    const Quat<R> axis = turned[k] * f.right;
-    const R length = exp_of_negative(max(log_scales[k] - f.longest, real<R>(-80)));
-    f.space[k] = Vec3<R>{axis.x, axis.y, axis.z} * length;
-    f.time[k] = axis.w * length;
+    const R length = exp_of_negative(max(log_scales[k] - f.longest, real<R>(-kLargestExponent)));
+    f.space[k] = space[k] * length;
+    f.time[k] = time[k] * length;
     f.largest = max(f.largest, abs(f.time[k]));
   }
   R square = zero;

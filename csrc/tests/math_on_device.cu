@@ -13,6 +13,7 @@
 #include "math/scalar.hpp"
 #include "math/shading.hpp"
 #include "math/skinning.hpp"
+#include "math/slicing.hpp"
 #include "math/ssim.hpp"
 #include "math/vec.hpp"
 #include "math/volume.hpp"
@@ -124,6 +125,17 @@ __global__ void posing(Numbers<S> n) {
 }
 
 template <class S>
+__global__ void slicing(Numbers<S> n) {
+  const S logs[4] = {n.next(), n.next(), n.next(), n.next()};
+  const SpaceTime<S> f = space_time(n.quat(), n.quat(), logs);
+  const SlicedShape<S> shape = sliced_shape(f);
+  const S limit = n.next();
+  const SliceGrad<S> g{n.vec(), n.quat(), {n.next(), n.next(), n.next()}, n.next()};
+  const SpaceTimeGrad<S> by = slice_vjp(f, shape, n.next(), n.next(), limit, g);
+  n.put(sliced_mean(by.mean, f.velocity, by.time)), n.put(by.left), n.put(by.right), n.put(log_deviation(f));
+}
+
+template <class S>
 __global__ void planes(Numbers<S> n) {
   const Cell<S> cell = locate(n.next(), 64);
   const TimeRows rows = time_rows(double(n.next()), 25);
@@ -177,7 +189,8 @@ __global__ void training(Numbers<S> n) {
 template <class S>
 void launch_all(Numbers<S> n) {
   rotations<<<1, 1>>>(n), projection<<<1, 1>>>(n), harmonics<<<1, 1>>>(n), blending<<<1, 1>>>(n);
-  deformation<<<1, 1>>>(n), posing<<<1, 1>>>(n), planes<<<1, 1>>>(n), training<<<1, 1>>>(n);
+  deformation<<<1, 1>>>(n), posing<<<1, 1>>>(n), slicing<<<1, 1>>>(n), planes<<<1, 1>>>(n);
+  training<<<1, 1>>>(n);
   fields<<<1, 1>>>(n, FieldArrays<S>{}, nullptr, nullptr);
 }
 template void launch_all<float>(Numbers<float>);

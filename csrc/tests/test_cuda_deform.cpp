@@ -210,6 +210,92 @@ void test_no_gaussians_posed() {
          "no Gaussians, no gradients by transforms");
 }
 
+// Slicing -------------------------------------------------------------------------------------------------------------
+
+// Of all inputs, of the slice, and of the gradients by the inputs, in the order of the structs.
+using Parts = std::vector<Values>;
+constexpr int64_t kInputs[] = {3, 1, 4, 4, 3, 1, 1}, kSliced[] = {3, 4, 3, 1, 12};
+
+struct SlicingCase {
+  int64_t count;
+  Parts inputs, g;
+};
+
+SlicingCase slicing_case(int64_t count) {
+  SlicingCase c{count, {}, {}};
+  for (const int64_t size : kInputs) c.inputs.push_back(uniforms(size * count, -1, 1));
+  for (const int64_t size : kSliced) c.g.push_back(uniforms(size * count, -1, 1));
+  for (int64_t i = 0; i < 3 * count; ++i) c.inputs[4][i] -= i % 3;  // far from equal
+  for (int64_t i = 0; i < count; ++i) c.inputs[5][i] = -std::abs(c.inputs[5][i]);
+  return c;
+}
+
+template <class S, class Arrays>
+SpaceTimeGaussians<S> slicing_input(int64_t count, const Arrays& x) {
+  return {count, x(0), x(1), x(2), x(3), x(4), x(5), x(6)};
+}
+
+Parts slice_on_cpu(const SlicingCase& c, const SliceTime<double>& at) {
+  Parts r;
+  for (const int64_t size : kSliced) r.push_back(Values(size * c.count));
+  for (const int64_t size : kInputs) r.push_back(Values(size * c.count));
+  for (const int64_t size : {4, 3, 3, 1}) r.push_back(Values(size * c.count));
+  const auto in = slicing_input<double>(c.count, [&](int k) { return c.inputs[k].data(); });
+  const auto to = [&](int k) { return r[k].data(); };
+  slice_forward<double>(in, at, {to(0), to(1), to(2), to(3), to(4)}, 1);
+  slice_backward<double>(in, at, {to(0), to(1), to(2), to(3), to(4)},
+                         {c.g[0].data(), c.g[1].data(), c.g[2].data(), c.g[3].data()},
+                         {to(5), to(6), to(7), to(8), to(9), to(10), to(11)}, 1);
+  condition<double>(in, {to(12), to(13), to(14), to(15)}, 1);
+  return r;
+}
+
+std::vector<std::vector<float>> slice_on_gpu(const SlicingCase& c, const SliceTime<float>& at) {
+  std::vector<std::unique_ptr<Memory<float>>> inputs, g, r;
+  for (const Values& x : c.inputs) inputs.push_back(std::make_unique<Memory<float>>(as<float>(x)));
+  for (const Values& x : c.g) g.push_back(std::make_unique<Memory<float>>(as<float>(x)));
+  for (const int64_t size : {3, 4, 3, 1, 12, 3, 1, 4, 4, 3, 1, 1, 4, 3, 3, 1})
+    r.push_back(std::make_unique<Memory<float>>(size * c.count));
+  const auto in = slicing_input<float>(c.count, [&](int k) { return inputs[k]->get(); });
+  const auto to = [&](int k) { return r[k]->get(); };
+  cuda::slice_forward(in, at, {to(0), to(1), to(2), to(3), to(4)}, nullptr);
+  cuda::slice_backward(in, at, {to(0), to(1), to(2), to(3), to(4)},
+                       {g[0]->get(), g[1]->get(), g[2]->get(), g[3]->get()},
+                       {to(5), to(6), to(7), to(8), to(9), to(10), to(11)}, nullptr);
+  cuda::condition(in, {to(12), to(13), to(14), to(15)}, nullptr);
+  std::vector<std::vector<float>> values;
+  for (const auto& x : r) values.push_back(x->values());
+  return values;
+}
+
+void test_slicing(int64_t count) {
+  const char* const names[] = {"sliced means",
+                               "sliced quaternions",
+                               "sliced scales",
+                               "sliced logits",
+                               "bases of slices",
+                               "gradient by means of slices",
+                               "gradient by times",
+                               "gradient by left quaternions",
+                               "gradient by right quaternions",
+                               "gradient by scales of slices",
+                               "gradient by spans",
+                               "gradient by logits of slices",
+                               "conditional quaternions",
+                               "conditional scales",
+                               "velocities",
+                               "deviations of time"};
+  const SlicingCase c = slicing_case(count);
+  const auto gpu = slice_on_gpu(c, {0.3f, 3.f});
+  const Parts cpu = slice_on_cpu(c, {0.3f, 3.});
+  for (size_t k = 0; k < gpu.size(); ++k)
+    expect_close(std::string(names[k]) + " of " + std::to_string(count), gpu[k], cpu[k], 1e-4);
+  in_other_orders([&] {
+    const auto again = slice_on_gpu(c, {0.3f, 3.f});
+    for (size_t k = 0; k < gpu.size(); ++k) expect_same_bits(std::string(names[k]) + " again", again[k], gpu[k]);
+  });
+}
+
 // Planes --------------------------------------------------------------------------------------------------------------
 
 struct PlaneCase {
@@ -440,6 +526,7 @@ int main() {
   test_skinning(5, 3, 40, 3), test_skinning(300, 7, 500, 4), test_skinning(2, 0, 300, 1);
   test_far_points();
   test_posing(1, 1), test_posing(150, 24), test_posing(700, 3), test_no_gaussians_posed();
+  test_slicing(1), test_slicing(300), slice_on_gpu(slicing_case(0), {0, 3});
   test_planes("two levels", plane_case(5, 150, 0.37, {{7, 4}, {17, 3}}));
   test_planes("more channels than a warp has lanes", plane_case(40, 60, 1, {{4, 5}}));
   test_planes("one sample", plane_case(3, 30, 0, {{1, 1}, {2, 2}}));

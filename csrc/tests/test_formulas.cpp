@@ -1,4 +1,4 @@
-// Blending, ellipses, skinning, posing, planes, SSIM, Adam and colour inputs of csrc/math, on scalars: every hand-derived vjp against
+// Blending, ellipses, skinning, posing, slicing, planes, SSIM, Adam and colour inputs of csrc/math, on scalars: every hand-derived vjp against
 // central differences in double, the rest against plain formulas.
 #include "math/adam.hpp"
 #include "math/blend.hpp"
@@ -7,6 +7,7 @@
 #include "math/posing.hpp"
 #include "math/shading.hpp"
 #include "math/skinning.hpp"
+#include "math/slicing.hpp"
 #include "math/ssim.hpp"
 #include "tests/check.hpp"
 
@@ -300,6 +301,73 @@ void test_posing() {
   expect(std::isnan(lost.log_scales[0] + lost.log_scales[1] + lost.log_scales[2]), "NaN in a scale stays");
 }
 
+// Inputs in a row: mean 0-2, time 3, quaternions 4-11, log scales 12-15, logit 16.
+SpaceTime<double> space_time_of(const Values& v) {
+  return space_time<double>(load_quat(v.data() + 4), load_quat(v.data() + 8), {v[12], v[13], v[14], v[15]});
+}
+
+Values slice_of(const Values& v, double time) {
+  const SpaceTime<double> f = space_time_of(v);
+  const SlicedShape<double> s = sliced_shape(f);
+  Values out;
+  append(out, sliced_mean(vec(v, 0), f.velocity, time - v[3]));
+  out.insert(out.end(), {s.quat.w, s.quat.x, s.quat.y, s.quat.z});
+  out.insert(out.end(), s.log_scales, s.log_scales + 3);
+  out.push_back(visibility(f, time - v[3], v[16], kLargestExponent).logit);
+  return out;
+}
+
+Values slice_gradient(const Values& v, double time, const Values& g) {
+  const SpaceTime<double> f = space_time_of(v);
+  const SliceGrad<double> by{vec(g, 0), load_quat(g.data() + 3), {g[7], g[8], g[9]}, g[10]};
+  const SpaceTimeGrad<double> found = slice_vjp(f, sliced_shape(f), time - v[3], v[16], kLargestExponent, by);
+  Values gradient;
+  append(gradient, found.mean);
+  gradient.push_back(found.time);
+  for (const Quat<double>& q : {found.left, found.right}) gradient.insert(gradient.end(), {q.w, q.x, q.y, q.z});
+  gradient.insert(gradient.end(), found.log_scales, found.log_scales + 4);
+  gradient.push_back(found.logit);
+  return gradient;
+}
+
+void test_slicing() {
+  Values v = uniforms(4, -0.5, 0.5), g = uniforms(11, -1, 1);
+  for (double x : uniforms(8, 0.3, 1)) v.push_back(x);
+  v.insert(v.end(), {uniform(-1.2, -1), uniform(-0.6, -0.4), uniform(0, 0.2), uniform(-0.5, 0.5), uniform(-2, 2)});
+  expect_vjp("slice_vjp", [](const Values& x) { return slice_of(x, 0.6); }, v, g, slice_gradient(v, 0.6, g));
+  // A still Gaussian is its own slice, however long it lives: spans of 1e-6 to 1e6 at scales near 1.
+  for (const double span : {-13.8, 0.0, 13.8}) {
+    Values still = v;
+    for (int k = 0; k < 4; ++k) still[8 + k] = k == 0 ? v[4] : -v[4 + k];
+    still[15] = span;
+    const SpaceTime<double> f = space_time_of(still);
+    const SlicedShape<double> s = sliced_shape(f);
+    expect(norm(f.velocity) == 0, "a still Gaussian does not move");
+    expect_near("its life", log_deviation(f), span, 1e-14);
+    const Mat3<double> found = covariance_of(s.quat, s.log_scales);
+    const Mat3<double> wanted = covariance_of(f.left, {v[12], v[13], v[14]});
+    for (int i = 0; i < 9; ++i) expect_near("a still Gaussian", found.m[i / 3][i % 3], wanted.m[i / 3][i % 3], 1e-14);
+  }
+  // Equal axes, vanishing ones, and a vanishing life.
+  for (const double log_scale : {0.0, -60.0, -1000.0})
+    for (int which = 12; which < 16; ++which) {
+      Values flat = v;
+      flat[12] = flat[13] = flat[14] = flat[15] = 0;
+      flat[which] = log_scale;
+      for (double x : slice_of(flat, flat[3])) expect(std::isfinite(x), "finite slices");
+      for (double x : slice_gradient(flat, flat[3], g)) expect(std::isfinite(x), "finite gradients of slices");
+    }
+  for (double x : {1e-12, 1e-3, 0.349, 0.351, 20.0})
+    expect_near("1 - exp(-x)", one_minus_exp(x, std::exp(-x)) / -std::expm1(-x), 1, 1e-15);
+  for (int at = 0; at < 17; ++at) {
+    Values lost = v;
+    lost[at] = kNaN<double>;
+    double sum = 0;
+    for (double x : slice_of(lost, 0.6)) sum += x;
+    expect(std::isnan(sum), "NaN stays in a slice");
+  }
+}
+
 // 12 samples of three planes, 6 of three lines, then three coordinates in samples.
 Values plane_feature(const Values& v) {
   constexpr int kFast[] = {0, 0, 1}, kSlow[] = {1, 2, 2};
@@ -413,7 +481,7 @@ int main() {
   skip_unless_supported();
   for (int trial = 0; trial < 10; ++trial) {
     test_vectors(), test_blend_vjp(), test_blend_packets(), test_ellipse();
-    test_skinning(), test_posing(), test_planes(), test_plane_cells();
+    test_skinning(), test_posing(), test_slicing(), test_planes(), test_plane_cells();
     test_shading(), test_ssim(), test_adam();
   }
   return report();

@@ -121,6 +121,8 @@ class DeformationField:
     """Opacities may fade in or out, so that a Gaussian exists for a part of the clip."""
     can_freeze = True
     """Moving Gaussians become static where their motion is too small to be visible."""
+    depends_on_view = False
+    """Motion differs between cameras."""
 
     @property
     def num_values(self) -> int:
@@ -145,9 +147,18 @@ class DeformationField:
         raise NotImplementedError
 
     def deform(
-        self, gaussians: Gaussians, moving: MovingRows, time: float, *, in_training: bool = False
+        self,
+        gaussians: Gaussians,
+        moving: MovingRows,
+        time: float,
+        *,
+        in_training: bool = False,
+        eye: Tensor | None = None,
     ) -> DeformedGaussians:
-        """Return ``gaussians`` (A) with the moving ones at ``time``; in training with penalties."""
+        """Return ``gaussians`` (A) with the moving ones at ``time``; in training with penalties.
+
+        ``eye``: (3,) camera centre, if the field depends on the view; None: no camera.
+        """
         penalties: dict[str, Tensor] = {}
         if in_training and moving.visible is None:
             offsets, penalties = self.in_training(moving.means, time)

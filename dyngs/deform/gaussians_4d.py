@@ -8,7 +8,7 @@ harmonics times a cosine series in time. Slicing is one operation of the kernels
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -16,6 +16,7 @@ from torch import Tensor
 
 from dyngs.core.conventions import MAX_SH_DEGREE, num_sh_terms
 from dyngs.core.state import Role
+from dyngs.deform import predictor
 from dyngs.deform.field import (
     DeformationField,
     DeformedGaussians,
@@ -29,6 +30,7 @@ from dyngs.deform.keys import Gaussians4DField
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.densify import SPLIT_SHRINK
 from dyngs.gaussians.optimizer import Parameters
+from dyngs.ops.adam import Count
 from dyngs.ops.quaternions import identity_quat, quat_product, unit_quats
 from dyngs.ops.slicing import condition_gaussians, slice_gaussians
 
@@ -67,6 +69,9 @@ class Gaussians4D(DeformationField):
         count = setup.num_moving
         quats = identity_quat(torch.zeros(1, device="cpu")).expand(count, 4)
         centers = torch.full((count,), 0.5, device="cpu")
+        width = options.predictor_width
+        self.depends_on_view = width > 0
+        self._network = predictor.start_values(width, generator) if width else {}
         spans = torch.ones(count, device="cpu")
         self.parameters = self._untrained(centers, spans, quats)
 
@@ -84,46 +89,100 @@ class Gaussians4D(DeformationField):
         parameters = self._untrained(start.centers, spans, right_quats)
         return self.with_parameters(parameters), tilted
 
+    def step(self, step: int, progress: float) -> Count:
+        for name in self._network:
+            weights = self.parameters[name]
+            if weights.grad is not None:
+                weights.grad.add_(weights.detach(), alpha=predictor.WEIGHT_DECAY)
+        return super().step(step, progress)
+
     def deform(
-        self, gaussians: Gaussians, moving: MovingRows, time: float, *, in_training: bool = False
+        self,
+        gaussians: Gaussians,
+        moving: MovingRows,
+        time: float,
+        *,
+        in_training: bool = False,
+        eye: Tensor | None = None,
     ) -> DeformedGaussians:
         own = gaussians if moving.rows is None else gaussians.picked(moving.rows)
-        times, log_spans, right_quats = (
-            select_rows(self.parameters[name], moving.visible)
-            for name in ("times", "log_spans", "right_quats")
+        now = own.means.new_full((1, 1), time)
+        means, times, log_scales, log_spans, quats, right_quats = self._shapes(
+            own, moving.visible, now, eye
         )
         sliced = slice_gaussians(
-            own.means,
+            means,
             times[:, 0],
-            own.quats,
+            quats,
             right_quats,
-            own.log_scales,
+            log_scales,
             log_spans[:, 0],
             own.logit_opacities,
             time,
             MIN_WEIGHT,
         )
-        now = Gaussians(*sliced, self._colours(own.sh, time - times, moving.visible))
+        drawn = Gaussians(*sliced, self._colours(own.sh, time - times, moving.visible))
         if moving.rows is None:
-            return DeformedGaussians(now)
+            return DeformedGaussians(drawn)
         tensors = gaussians.tensors()
-        for name, values in now.tensors().items():
+        for name, values in drawn.tensors().items():
             tensors[name] = tensors[name].index_copy(0, moving.rows, values)
         return DeformedGaussians(Gaussians(**tensors))
 
-    @torch.no_grad()
-    def linear(self, gaussians: Gaussians) -> LinearGaussians:
-        """Return the motion and the conditional covariances of the canonical ``gaussians`` (M)."""
-        times = self.parameters["times"][:, 0]
-        log_spans = self.parameters["log_spans"][:, 0]
-        quats, log_scales, velocities, log_stds = condition_gaussians(
-            gaussians.quats, self.parameters["right_quats"], gaussians.log_scales, log_spans
+    def _shapes(
+        self, gaussians: Gaussians, visible: Tensor | None, now: Tensor, eye: Tensor | None
+    ) -> Sequence[Tensor]:
+        """Return means, their times, log scales, log spans, and left and right rotations.
+
+        The predictor multiplies means about the centre of the motion and the middle of the clip. It
+        multiplies a scale by exp(c) instead of 1 + c, which stays positive.
+
+        Args:
+            gaussians: A canonical Gaussians.
+            visible: their indices (A,) among the moving ones; None: all.
+            now: (1, 1), or (A, 1) with a time for each Gaussian.
+            eye: (3,) camera centre; None: no camera.
+        """
+        times, log_spans, right_quats = (
+            select_rows(self.parameters[name], visible)
+            for name in ("times", "log_spans", "right_quats")
         )
-        conditioned = gaussians.replace(quats=quats, log_scales=log_scales)
-        return LinearGaussians(conditioned, velocities, times, log_stds)
+        means = gaussians.means
+        quats = gaussians.quats
+        shapes = means, times, gaussians.log_scales, log_spans, quats, right_quats
+        if not self.depends_on_view:
+            return shapes
+        directions = None
+        if eye is not None:
+            away = means.detach() - eye.detach().to(means)
+            directions = torch.nn.functional.normalize(away, dim=1)
+        inside = self.setup.normalize(means.detach())
+        changes = predictor.predict_changes(
+            self.parameters, inside, times.detach(), directions, now
+        )
+        factors = means - self.setup.center, times - 0.5, 1, 1, quats, right_quats
+        parts = zip(shapes, factors, changes.split([3, 1, 3, 1, 4, 4], dim=1), strict=True)
+        return [x + factor * change for x, factor, change in parts]
 
     @torch.no_grad()
-    def lifetimes(self, gaussians: Gaussians) -> Tensor:
+    def linear(self, gaussians: Gaussians) -> LinearGaussians:
+        """Return the motion and the conditional covariances of the canonical ``gaussians`` (M).
+
+        With a predictor, each as it is at its mean time, without a camera.
+        """
+        means, times, log_scales, log_spans, quats, right_quats = self._shapes(
+            gaussians, None, self.parameters["times"], None
+        )
+        quats, log_scales, velocities, log_stds = condition_gaussians(
+            quats, right_quats, log_scales, log_spans[:, 0]
+        )
+        conditioned = gaussians.replace(means=means, quats=quats, log_scales=log_scales)
+        return LinearGaussians(conditioned, velocities, times[:, 0], log_stds)
+
+    @torch.no_grad()
+    def lifetimes(self, gaussians: Gaussians) -> Tensor | None:
+        if self.depends_on_view:  # which may lengthen them
+            return None
         motion = self.linear(gaussians)
         # A little longer, because slicing rounds otherwise.
         reach = (1 + 1e-4) * math.sqrt(-2 * math.log(MIN_WEIGHT)) * motion.log_stds.double().exp()
@@ -221,7 +280,10 @@ class Gaussians4D(DeformationField):
             "right_quats": LR_QUATS,
             "sh_time": LR_SH,
         }
-        return Parameters(tensors, rates, LR_DECAY, Role.PER_MOVING)
+        roles = dict.fromkeys(tensors, Role.PER_MOVING) | dict.fromkeys(self._network, Role.SHARED)
+        decays = dict.fromkeys(tensors, LR_DECAY) | dict.fromkeys(self._network, predictor.LR_DECAY)
+        rates |= dict.fromkeys(self._network, predictor.LR)
+        return Parameters(tensors | self._network, rates, decays, roles)
 
 
 def tilt_in_time(

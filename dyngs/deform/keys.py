@@ -12,6 +12,7 @@ COPIES_OF_MOVING = 12_000
 """Most copies over time of the moving Gaussians that free primitives start with."""
 
 
+Weight = Annotated[float, Field(ge=0)]
 Attribute = Literal["rotations", "scales", "opacities", "colors"]
 
 
@@ -68,7 +69,7 @@ class HexplaneField(FieldSection):
         default=False,
         description="whether positions also receive the gradient through the planes, as in 4DGS",
     )
-    penalty_weights: tuple[float, float, float] = Field(
+    penalty_weights: tuple[Weight, Weight, Weight] = Field(
         default=(1e-4, 0.01, 1e-4),
         description="weights of the smoothness of space planes, smoothness along time, and "
         "sparsity of time planes; 4DGS: 2e-4, 1e-3, 1e-4 for real captures",
@@ -170,6 +171,12 @@ class Gaussians4DField(Section):
         default=5e-6,
         description="mean gradient by the mean time, in clips, above which Gaussians are cloned or split",
     )
+    predictor_width: int = Field(
+        default=0,
+        ge=0,
+        description="neurons per layer of a network that deforms the moving Gaussians by view and time; 0: none; "
+        "MEGA: 256",
+    )
 
 
 DeformField = HexplaneField | MlpField | ControlNodesField | FreeField | Gaussians4DField
@@ -262,4 +269,6 @@ class DynamicModel(SceneModel):
     @property
     def bytes_per_moving_gaussian(self) -> int:
         # activations per Gaussian of space-time grids or networks
+        if isinstance(self.deform, Gaussians4DField):
+            return 200 + 20 * self.deform.predictor_width
         return 200 if isinstance(self.deform, (ControlNodesField, *TIMED_FIELDS)) else 2000

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from dyngs.core.state import Role, State, StateTensor, add_prefix, select_prefix
-from dyngs.core.tensor_checks import require_ascending, require_indices
+from dyngs.core.tensor_checks import require_ascending, require_indices, require_tensor
 from dyngs.deform.field import DeformationField, DeformedGaussians, MovingRows
 from dyngs.deform.fields import field_state, restore_field
 from dyngs.deform.gaussians_4d import Gaussians4D
@@ -19,6 +20,7 @@ from dyngs.gaussians.filters import apply_filter, filter_state, restore_filter
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep, restore_times, times_state
 from dyngs.gaussians.visibility import VisibilityMasks, intersect_sorted
 from dyngs.models.renderable import Renderable, clamp_time
+from dyngs.ops.quaternions import identity_quat
 
 _NONE = torch.zeros(0, dtype=torch.long, device="cpu")
 
@@ -46,6 +48,9 @@ class DynamicScene(GaussianScene):
         rows = tensors.get("rows", torch.arange(count, device=gaussians.means.device))
         require_ascending("rows", require_indices("rows", rows, (None,), count))
         field = restore_field(options.deform, own, len(rows))
+        if "left_quats" in own:
+            left = require_tensor("left_quats", own["left_quats"], (len(rows), 4))
+            gaussians = gaussians.replace(quats=gaussians.quats.index_copy(0, rows, left))
         return DynamicScene(
             gaussians=gaussians,
             training_times=times,
@@ -84,7 +89,9 @@ class DynamicScene(GaussianScene):
         if self.field is None or self.is_static:
             return GaussianTimeStep(apply_filter(self.gaussians, self.filter_std), now)
         part = self._visible_around(now)
-        return GaussianTimeStep(part.deform(self.field, now).gaussians, now)
+        deform = partial(part.deform, self.field, now)
+        from_eye = (lambda eye: deform(eye=eye).gaussians) if self.field.depends_on_view else None
+        return GaussianTimeStep(deform().gaussians, now, from_eye=from_eye)
 
     def drawing_step(self, time: float | None) -> GaussianTimeStep:
         """Return ``time_step``; without gradients only the Gaussians that are drawn at ``time``."""
@@ -104,8 +111,10 @@ class DynamicScene(GaussianScene):
         part = self._select(self.gaussians, torch.nonzero(is_drawn)[:, 0])
         return GaussianTimeStep(part.deform(self.field, now).gaussians, now)
 
-    def in_training(self, time: float, *, detach: bool) -> DeformedGaussians:
-        """Return the Gaussians at ``time`` with offsets and penalties.
+    def in_training(
+        self, time: float, *, detach: bool, eye: Tensor | None = None
+    ) -> DeformedGaussians:
+        """Return the Gaussians at ``time``, seen from ``eye`` (3,), with offsets and penalties.
 
         With ``detach`` only the field gets gradients, not the canonical Gaussians.
         """
@@ -114,7 +123,7 @@ class DynamicScene(GaussianScene):
         part = self._select(
             self.gaussians.detach() if detach else self.gaussians, self._active(time)
         )
-        return part.deform(self.field, time, in_training=True)
+        return part.deform(self.field, time, in_training=True, eye=eye)
 
     def apply_edit(self, edit: TopologyEdit) -> DynamicScene:
         position = torch.full((len(self),), -1, device=self.moving.device)
@@ -139,6 +148,10 @@ class DynamicScene(GaussianScene):
         if isinstance(self.field, Gaussians4D) and len(self.moving):
             quats = self.gaussians.quats.detach()
             left, right = self.field.storage_quats(quats[self.moving])
+            if self.field.depends_on_view:  # which multiplies each number of a rotation
+                state["model.field.left_quats"] = StateTensor(quats[self.moving], Role.PER_MOVING)
+                left = identity_quat(left).expand_as(left)
+                right = self.field.parameters["right_quats"].detach()
             left = quats.index_copy(0, self.moving, left)
             state["gaussians.quats"] = StateTensor(left, Role.PER_GAUSSIAN)
             state["model.field.learned.right_quats"] = StateTensor(right, Role.PER_MOVING)
@@ -191,9 +204,14 @@ class _VisiblePart:
     moving: MovingRows
 
     def deform(
-        self, field: DeformationField, time: float, *, in_training: bool = False
+        self,
+        field: DeformationField,
+        time: float,
+        *,
+        in_training: bool = False,
+        eye: Tensor | None = None,
     ) -> DeformedGaussians:
-        now = field.deform(self.gaussians, self.moving, time, in_training=in_training)
+        now = field.deform(self.gaussians, self.moving, time, in_training=in_training, eye=eye)
         filtered = apply_filter(now.gaussians, self.filter_std)
         shaded = field.apply_shading(filtered, self.moving.rows, self.moving.visible, time)
         return replace(now, gaussians=shaded)

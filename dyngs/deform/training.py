@@ -157,7 +157,8 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         if scene.field is None:
             return scene.time_step(image.time)
         time = (image.time or 0.0) + self._time_noise(step)
-        now = scene.in_training(time, detach=self._window.is_frontier_step(step))
+        detach = self._window.is_frontier_step(step)
+        now = scene.in_training(time, detach=detach, eye=image.cameras.centers[0])
         penalties = now.penalties | self._sparsity(now.offsets)
         return GaussianTimeStep(now.gaussians, image.time, None, penalties)
 

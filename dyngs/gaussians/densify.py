@@ -37,9 +37,14 @@ class DensifySchedule:
     every: int
     resets: tuple[int, ...] = ()
     prune_scale_after: int = 0  # too large Gaussians are pruned from this step on
+    prunes_to_end: bool = False  # transparent Gaussians are also pruned after ``stop``
 
     def densifies_at(self, step: int) -> bool:
         return self.start < step < self.stop and step % self.every == 0
+
+    def prunes_at(self, step: int) -> bool:
+        """Return whether transparent Gaussians are pruned at ``step``, without densification."""
+        return self.prunes_to_end and step >= self.stop and step % self.every == 0
 
 
 class Densifier:
@@ -157,6 +162,8 @@ class DefaultDensifier(Densifier):
             result = self._densify(step, parameters, generator)
             self.sums = torch.zeros(2, 0, device="cpu")
             self.time_sums = self.sums
+        elif self.schedule.prunes_at(step):
+            return prune_transparent(parameters, self.options.prune_opacity)
         elif resets:
             result = EditResult(None)
         else:
@@ -265,6 +272,13 @@ def plan_edit(
     if not bool((kept | split).any()):
         kept[parameters.logit_opacities.nan_to_num(nan=-math.inf).argmax()] = True
     return EditPlan(kept, cloned, split)
+
+
+def prune_transparent(parameters: Gaussians, min_opacity: float) -> EditResult | None:
+    """Remove Gaussians below ``min_opacity``; None if there are none, or only such."""
+    kept = parameters.opacities >= min_opacity
+    is_due = bool(kept.any()) and not bool(kept.all())
+    return EditResult(TopologyEdit.select(kept)) if is_due else None
 
 
 def apply_plan(parameters: Gaussians, plan: EditPlan, generator: torch.Generator) -> EditResult:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -262,9 +262,11 @@ def build_densifier(run: StartContext) -> Densifier:
             center = torch.from_numpy(
                 scene_geometry(run.capture).camera_centers.mean(axis=0)
             ).float()
-            return DefaultDensifier(
-                options, densify_schedule(strategy, steps, on_white), run.extent, center
+            schedule = replace(
+                densify_schedule(strategy, steps, on_white),
+                prunes_to_end=run.config.colour.opacity_entropy > 0,
             )
+            return DefaultDensifier(options, schedule, run.extent, center)
         case FixedStrategy():
             return Densifier()
         case _:

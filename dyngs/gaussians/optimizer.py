@@ -136,8 +136,8 @@ class Parameters:
     """Leaf tensors that Adam optimises in place.
 
     Args:
-        decay: ratio of the last to the first learning rate, log-linear between. 0: linear decay to
-            0.
+        decay: ratio of the last to the first learning rate, of all tensors or of each by name;
+            log-linear between. 0: linear decay to 0.
         roles: role of all tensors, or of each by name.
     """
 
@@ -145,7 +145,7 @@ class Parameters:
         self,
         tensors: Mapping[str, Tensor],
         rates: Mapping[str, float],
-        decay: float = 1.0,
+        decay: float | Mapping[str, float] = 1.0,
         roles: Roles = Role.SHARED,
     ) -> None:
         self.decay, self.rates = decay, dict(rates)
@@ -177,13 +177,18 @@ class Parameters:
             progress: 0 at the first update, 1 at the last; sets the learning rates.
         """
         progress = min(progress, 1.0)
-        return self.update(step, self.decay**progress if self.decay > 0 else 1 - progress)
+        rates: dict[str, float] = {}
+        for name in self._tensors:
+            decay = self.decay[name] if isinstance(self.decay, Mapping) else self.decay
+            rates[name] = self.rates[name] * (decay**progress if decay > 0 else 1 - progress)
+        return self._update(step, rates)
 
     def update(self, step: int, factor: float) -> Count:
         """Update all tensors with their learning rates times ``factor``; see ``step``."""
-        updates = [
-            self._update_of(name, x, self.rates[name] * factor) for name, x in self._tensors.items()
-        ]
+        return self._update(step, {name: self.rates[name] * factor for name in self._tensors})
+
+    def _update(self, step: int, rates: Mapping[str, float]) -> Count:
+        updates = [self._update_of(name, x, rates[name]) for name, x in self._tensors.items()]
         return self._adam.steps_(updates, step=step)
 
     def _update_of(self, name: str, x: Tensor, lr: float) -> AdamUpdate | None:

@@ -8,7 +8,7 @@ training, after loading and in the viewer. ``gaussians.model`` trains it.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, TypeVar
 
@@ -27,7 +27,13 @@ from dyngs.gaussians.colour.network import ColourNetwork, RestPose, restore_colo
 from dyngs.gaussians.rendering import GaussianRendering, RenderOptions, Shader, render
 from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.models.checkpoint import Checkpoint, restore_model
-from dyngs.models.renderable import Renderable, TimeStep, near_plane
+from dyngs.models.renderable import (
+    Renderable,
+    TimeStep,
+    concatenate_renderings,
+    near_plane,
+    single_views,
+)
 from dyngs.models.views import background_colour
 
 S = TypeVar("S", bound="GaussianScene")
@@ -43,6 +49,9 @@ class GaussianTimeStep(TimeStep):
     rest_pose: RestPose | None = None
     # Differentiable weighted regularisation terms by name; empty outside training.
     penalties: dict[str, Tensor] = field(default_factory=dict)
+    # returns the Gaussians seen from a camera centre (3,), if they depend on it; ``gaussians`` are
+    # then those without a camera
+    from_eye: Callable[[Tensor], Gaussians] | None = None
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -162,6 +171,16 @@ class GaussianScene(Renderable):
         device = now.gaussians.means.device
         if cameras.cam_from_world.device != device:
             cameras = cameras.to(device=device)
+        if now.from_eye is not None:
+            renderings = []
+            for i, (camera, own_behind) in enumerate(single_views(cameras, behind)):
+                gaussians = now.from_eye(camera.centers[0])
+                own = replace(now, gaussians=gaussians, from_eye=None)
+                signal = None if probe is None else probe[i : i + 1]
+                renderings.append(
+                    self.render(camera, own, options=how, background=own_behind, probe=signal)
+                )
+            return concatenate_renderings(renderings)
         return render(
             now.gaussians, cameras, how, background=behind, probe=probe, shader=self.shader(now)
         )

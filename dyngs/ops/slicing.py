@@ -80,8 +80,12 @@ def slice_gaussians(
     check_number("min_weight", min_weight, 0, 1)
     limit = min(_LARGEST_EXPONENT, -math.log(min_weight)) if min_weight > 0 else _LARGEST_EXPONENT
     tensors = means, times, quats, right_quats, log_scales, log_spans, logit_opacities
+    return slicing_op(*_as_one_dtype(*tensors), float(time), limit)[:4]
+
+
+def _as_one_dtype(*tensors: Tensor) -> list[Tensor]:
     dtype = reduce(torch.promote_types, (x.dtype for x in tensors), torch.float32)
-    return slicing_op(*(x.to(dtype) for x in tensors), float(time), limit)[:4]
+    return [x.to(dtype) for x in tensors]
 
 
 def _conditioning(
@@ -105,5 +109,5 @@ def condition_gaussians(
 
     Arguments as in ``slice_gaussians``.
     """
-    shapes = quats, right_quats, log_scales, log_spans
+    shapes = _as_one_dtype(quats, right_quats, log_scales, log_spans)
     return conditioning_op(*(x.detach() for x in shapes))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -141,6 +142,25 @@ def test_pruning_keeps_at_least_one_gaussian() -> None:
     assert result is not None
     assert result.edit is not None
     assert result.edit.source.tolist() == [2]
+
+
+@pytest.mark.parametrize("prunes_to_end", [False, True])
+def test_opacity_entropy_prunes_to_the_end_of_the_run(prunes_to_end: bool) -> None:
+    """At the interval of densification, after it stopped; nothing grows, and one always stays."""
+    schedule = replace(SCHEDULE, prunes_to_end=prunes_to_end)
+    densifier = DefaultDensifier(DefaultStrategy(), schedule, EXTENT, torch.zeros(3))
+    _signal(densifier, [1.0, 1.0, 1.0])
+    for step, opacities, kept in (
+        (1000, [0.5, 0.004, 0.006], [0, 2]),
+        (1100, [0.004, 0.5, 0.5], [1, 2]),
+        (1150, [0.004, 0.5, 0.5], None),
+        (1200, [0.5, 0.5, 0.5], None),
+        (1300, [0.001, 0.001, 0.001], None),
+    ):
+        result = densifier.edit(step, _gaussians([SMALL] * 3, opacities), torch.Generator())
+        edit = None if result is None else result.edit
+        found = None if edit is None else edit.source.tolist()
+        assert found == (kept if prunes_to_end else None), step
 
 
 @settings(max_examples=25, deadline=None)

@@ -51,6 +51,22 @@ def test_equals_adam_with_decaying_rate(decay: float) -> None:
         assert learned[name].grad is None
 
 
+def test_each_tensor_has_its_own_decay() -> None:
+    """Also from a checkpoint and on another device."""
+    decays = {"weight": 1.0, "bias": 0.01, "planes": 0.0}
+    learned = Parameters(start_values(), RATES, decays).with_state(
+        strip_roles(Parameters(start_values(), RATES).state())
+    )
+    alone = {name: Parameters(start_values(), RATES, decay) for name, decay in decays.items()}
+    for step in (1, 2):
+        for one in (learned, *alone.values()):
+            give_gradients(one, step)
+            one.step(step, 0.5 * step)
+        learned = learned.to("cpu")
+    for name, one in alone.items():
+        assert torch.equal(learned[name], one[name])
+
+
 def test_edited_rows_keep_moments_and_new_rows_start_without() -> None:
     """Only tensors with rows per Gaussian are edited; the previous parameters are unchanged."""
     roles = dict.fromkeys(SHAPES, Role.SHARED) | {"weight": Role.PER_MOVING}

@@ -18,7 +18,7 @@ class ColourSection(Section):
         default=0.0,
         ge=0,
         description="weight of the opacity entropy loss, the mean of -o ln o over opacities o, "
-        "which removes faint Gaussians; MEGA: 5e-4",
+        "which removes faint Gaussians; they are then pruned to the end of the run; MEGA: 5e-4",
     )
 
     def stored_degree(self, sh_degree: int) -> int:
@@ -49,6 +49,10 @@ class NetworkColour(ColourSection):
     )
     width: int = Field(default=32, ge=1, description="neurons per hidden layer; MEGA: 64")
     depth: int = Field(default=2, ge=1, le=8, description="number of hidden layers")
+    normals: bool = Field(
+        default=True,
+        description="whether the network also gets the normal of the Gaussian; MEGA: false",
+    )
     lr: ClassVar[float] = 0.01
     """Learning rate of the network; divided by 3 after 1/6, 1/2 and 5/6 of the run."""
 

@@ -221,12 +221,10 @@ def _add_lines(
     every time.
     """
     moving = field.linear(scene.gaussians.select(scene.moving))
-    now = scene.gaussians.replace(
-        quats=scene.gaussians.quats.index_copy(0, scene.moving, moving.gaussians.quats),
-        log_scales=scene.gaussians.log_scales.index_copy(
-            0, scene.moving, moving.gaussians.log_scales
-        ),
-    )
+    tensors = scene.gaussians.tensors()
+    for name, values in moving.gaussians.tensors().items():
+        tensors[name] = tensors[name].index_copy(0, scene.moving, values)
+    now = Gaussians(**tensors)
     times = torch.stack([moving.times, moving.log_stds], dim=1)
     lists.exact("lines", _numpy(torch.cat([moving.velocities, times], dim=1)[order]))
     header = {"moving": len(order), "least": MIN_WEIGHT, "waves": field.num_waves}

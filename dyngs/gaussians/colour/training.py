@@ -254,7 +254,7 @@ class NetworkTraining(ColourTraining):
     ) -> None:
         super().__init__(options)
         self.options, self.steps, self.box, self.uses_time = options, steps, box, uses_time
-        inputs = num_inputs(uses_time=uses_time, uses_normals=True)
+        inputs = num_inputs(uses_time=uses_time, uses_normals=options.normals)
         values = _start_values([inputs, *[options.width] * options.depth, 3], generator)
         self.parameters = Parameters(values, dict.fromkeys(values, options.lr))
 
@@ -264,7 +264,7 @@ class NetworkTraining(ColourTraining):
         layers = (
             Layer(self.parameters[f"weight{i}"], self.parameters[f"bias{i}"]) for i in range(count)
         )
-        return ColourNetwork(tuple(layers), self.box, self.uses_time, uses_normals=True)
+        return ColourNetwork(tuple(layers), self.box, self.uses_time, self.options.normals)
 
     @property
     def network_parameters(self) -> Parameters:

@@ -125,6 +125,7 @@ MEASURED_AFTER = 24
 
 COLOURS = {
     "network": NetworkColour(width=8, depth=1, opacity_entropy=1e-3),
+    "network without normals": NetworkColour(width=8, depth=1, normals=False),
     "none pays": AutoColour(tolerance=300.0),
     "some pay": AutoColour(tolerance=0.0),
 }

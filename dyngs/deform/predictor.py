@@ -1,0 +1,85 @@
+"""Predictor of view- and time-dependent deformation of 4D Gaussians (MEGA, Zhang et al. 2024).
+
+F(mean and its time, view direction, time) returns factors of the mean, the scales and both
+rotations, so that one Gaussian serves a longer part of the clip. No code was released: the number
+of octaves, the widths after the branches and the centre of the products are our choice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import pairwise
+
+import torch
+from torch import Tensor
+
+from dyngs.core.initialisation import glorot
+from dyngs.deform.networks import encode_frequencies
+from dyngs.gaussians.optimizer import Parameters
+from dyngs.ops.perceptron import Layer, perceptron
+
+OCTAVES = (
+    6  # of all encodings: 39 numbers of a direction and 13 of a time, as in the paper's figure
+)
+BRANCHES = {"means": 4, "directions": 3, "times": 1}  # inputs before their encoding
+BRANCH_OUTPUTS = 30
+NUM_FACTORS = 16
+LR, LR_DECAY = 8e-4, 0.002  # first learning rate, and ratio of the last to it
+WEIGHT_DECAY = 1e-6
+
+
+def _widths(width: int) -> Mapping[str, list[int]]:
+    """Return the layer widths of each branch and of the layers that join them."""
+    branches = {
+        name: [size * (1 + 2 * OCTAVES), width, BRANCH_OUTPUTS] for name, size in BRANCHES.items()
+    }
+    return branches | {"joined": [BRANCH_OUTPUTS * len(BRANCHES), width, width, NUM_FACTORS]}
+
+
+def start_values(width: int, generator: torch.Generator) -> dict[str, Tensor]:
+    """Return Glorot weights and zero biases; the last layer is zero, so that all factors are 1."""
+    values: dict[str, Tensor] = {}
+    for name, widths in _widths(width).items():
+        for i, (fan_in, fan_out) in enumerate(pairwise(widths)):
+            values[f"{name}_weight{i}"] = glorot(fan_in, fan_out, generator)
+            values[f"{name}_bias{i}"] = torch.zeros(fan_out, device="cpu")
+    values["joined_weight2"].zero_()
+    return values
+
+
+def predict_changes(
+    parameters: Parameters, means: Tensor, times: Tensor, directions: Tensor | None, now: Tensor
+) -> Tensor:
+    """Return the factors minus 1 (M, 16) of M Gaussians at the time ``now``.
+
+    Their order: mean (3), its time, scales (3), scale along time, left and right rotation (4 each).
+
+    Args:
+        means: (M, 3) means, -1 to 1 in the box of the motion.
+        times: (M, 1) mean times in clips.
+        directions: (M, 3) unit vectors from the camera; None: a view from nowhere, whose encoding
+            is zero.
+        now: (1, 1), or (M, 1) with a time for each Gaussian.
+    """
+
+    def branch(name: str, inputs: Tensor) -> Tensor:
+        return perceptron(inputs, _layers(parameters, name, 2))
+
+    def encoded(x: Tensor) -> Tensor:
+        return encode_frequencies(x, OCTAVES)
+
+    count = len(means)
+    no_view = means.new_zeros(1, BRANCHES["directions"] * (1 + 2 * OCTAVES))
+    views = no_view if directions is None else encoded(directions)
+    features = [
+        branch("means", encoded(torch.cat([means, 2 * times - 1], dim=1))),
+        branch("directions", views).expand(count, -1),
+        branch("times", encoded(2 * now - 1)).expand(count, -1),
+    ]
+    return perceptron(torch.cat(features, dim=1), _layers(parameters, "joined", 3))
+
+
+def _layers(parameters: Parameters, name: str, count: int) -> list[Layer]:
+    return [
+        Layer(parameters[f"{name}_weight{i}"], parameters[f"{name}_bias{i}"]) for i in range(count)
+    ]
