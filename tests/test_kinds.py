@@ -82,13 +82,14 @@ def test_times_make_a_dynamic_model(capture: Path, tmp_path: Path) -> None:
     assert isinstance(build_trainer(_dynamic(root, model=StaticModel())).model.scene, StaticScene)
 
 
-def test_opacity_is_trained_in_all_presets_but_that_of_the_published_protocol(
+def test_opacity_is_trained_in_all_presets_but_those_of_published_protocols(
     capture: Path,
 ) -> None:
-    """That one prints a line when training begins, not when a run is resumed."""
+    """Those print a line when training begins, not when a run is resumed."""
     presets = {name: load_config(name, [f"data.root={capture}"]) for name in packaged_presets()}
     weights = {name: config.train.alpha_weight for name, config in presets.items()}
-    others = {"blender": 0.0, "ngp": 0.01, "nerf": 0.01}  # fields: errors of colour are squared
+    others = {"ngp": 0.01, "nerf": 0.01}  # errors of colour are squared
+    others |= dict.fromkeys(("blender", "4dgs", "deformable_3dgs"), 0.0)
     assert weights == {name: others.get(name, 0.1) for name in presets}
 
     few = [f"data.root={capture}", "init.kind=random", "init.num_random=30"]
