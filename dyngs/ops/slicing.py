@@ -111,3 +111,32 @@ def condition_gaussians(
     """
     shapes = _as_one_dtype(quats, right_quats, log_scales, log_spans)
     return conditioning_op(*(x.detach() for x in shapes))
+
+
+def _time_harmonics(
+    sh: Tensor, sh_time: Tensor, rows: Tensor | None, elapsed: Tensor, seen: Tensor
+) -> Tensor:
+    out = empty_like(sh)
+    launch(sh, "time_harmonics", (sh, sh_time, rows, elapsed, seen), out)
+    return out
+
+
+def _time_harmonics_backward(x: Backward) -> Sequence[Tensor]:
+    sh, sh_time, rows, elapsed, _ = x.inputs
+    (by,) = x.grads
+    by_sh_time = empty_like(sh_time) if rows is None else torch.zeros_like(sh_time)
+    by_sh_time[len(sh) :] = 0
+    by_elapsed = empty_like(elapsed)
+    launch(sh, "time_harmonics_backward", x.inputs, by, by_sh_time, by_elapsed)
+    return by.clone(), by_sh_time, by_elapsed
+
+
+harmonics_in_time = register(
+    "harmonics_in_time", _time_harmonics, _time_harmonics_backward, "sh sh_time elapsed"
+)
+"""Return ``sh`` (A, K, 3) plus sum_n cos(2 pi n elapsed) a_n with coefficients a_n (K, 3), of which
+``sh_time`` (M, N K, 3) holds N for each of M Gaussians.
+
+``rows`` (A,) int64 of ``sh_time``, none twice; None: the first A. ``elapsed`` (A,). Where ``seen``
+(A,) is False, ``sh`` is returned, and the other gradients are zero.
+"""
