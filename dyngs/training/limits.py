@@ -55,7 +55,8 @@ def _kind_specific_options(config: Config) -> dict[str, object]:
         key: x for key, x in _single_image_options(config).items() if x == "always"
     }
     for name, section in (("budget", config.budget), ("prune", config.prune)):
-        changed = section.model_dump(exclude_defaults=True, exclude={"steps", "score"})
+        details = {"steps", "score", "signed", "mask_between"}
+        changed = section.model_dump(exclude_defaults=True, exclude=details)
         given |= {f"{name}.{key}": value for key, value in changed.items()}
     if config.train.minutes is not None:
         given["train.minutes"] = config.train.minutes

@@ -23,7 +23,13 @@ from dyngs.runs.checkpoint import SCENE_FILE, checkpoint_paths, latest_checkpoin
 from dyngs.training.new_trainer import build_trainer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-ASKED = ("prune.fraction=0.5", "prune.steps=6", "prune.mask_times=3", "run.threads=1")
+ASKED = (
+    "prune.fraction=0.5",
+    "prune.steps=6",
+    "prune.mask_times=3",
+    "prune.mask_between=false",
+    "run.threads=1",
+)
 BRIEFLY = ("prune.steps=4", "run.threads=1")
 
 
@@ -54,7 +60,7 @@ def few_candidates(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_it_is_the_stage_of_training_afterwards(run_dir: Path, tmp_path: Path) -> None:
     small = prune_run(run_dir, tmp_path / "small", ASKED)
     config = busy_config(load_resolved(run_dir).data.root, tmp_path / "whole", "control_nodes")
-    stage = PruneConfig(fraction=0.5, steps=6, mask_times=3)
+    stage = PruneConfig(fraction=0.5, steps=6, mask_times=3, mask_between=False)
     whole = train(config.model_copy(update={"prune": stage}))
     assert checkpoint_paths(small)[-1].read_bytes() == checkpoint_paths(whole)[-1].read_bytes()
     assert load_run(run_dir).step == 24, "the first run is as it was"

@@ -23,6 +23,7 @@ from dyngs.config import (
 )
 from dyngs.config.io import load_resolved
 from dyngs.deform.free import FreeInitialization, FreePrimitives
+from dyngs.deform.gaussians_4d import Gaussians4D
 from dyngs.deform.keys import FreeField
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians.densify import Densifier
@@ -149,6 +150,26 @@ def test_masks_are_trained_with(moving: Path, tmp_path: Path) -> None:
     grad = trainer.model.scene.gaussians.means.grad
     assert grad is not None
     assert torch.equal(torch.nonzero(grad.any(1))[:, 0], active)
+
+
+@pytest.mark.parametrize("is_kept", [True, False])
+def test_masks_as_published_drop_what_no_key_time_shows(
+    is_kept: bool, moving: Path, tmp_path: Path
+) -> None:
+    """4D Gaussians that last for a moment between two key times."""
+    stage = PruneConfig(mask_times=3, mask_between=is_kept)
+    trainer = trained(moving_config(moving, tmp_path, "gaussians_4d", stage))
+    scene = trainer.model.scene
+    assert isinstance(scene, DynamicScene)
+    assert isinstance(scene.field, Gaussians4D)
+    own = scene.field.parameters
+    left = scene.gaussians.quats.detach()[scene.moving]
+    own["right_quats"].data.copy_(left * left.new_tensor([1.0, -1.0, -1.0, -1.0]))
+    own["times"].data.fill_(scene.times[3])
+    own["log_spans"].data.fill_(-7.0)
+    masks = build_pruning_edit(trainer).masks
+    assert masks is not None
+    assert bool(masks.seen[0, scene.moving].any()) is is_kept
 
 
 def test_what_is_there_for_a_while_is_masked_only_while_it_is_not() -> None:
