@@ -17,6 +17,8 @@ from torch import Tensor
 
 from dyngs.ops.registration import Backward, check_number, empty_like, launch, register
 
+FADED_LOGIT = -1e4
+"""Opacity logit of Gaussians that are not seen at a time."""
 # Exponent of the smallest weight that float32 has room for.
 _LARGEST_EXPONENT = 80.0
 

@@ -284,7 +284,7 @@ def test_harmonics_over_time_are_a_cosine_series(num_terms: int) -> None:
     sh_time = normal(11, 3 * num_terms, 3, seed=1).requires_grad_()
     elapsed = torch.tensor([0.1, -7.3, 0.2, 1e3 + 0.4]).double().requires_grad_()
     found = harmonics_in_time(sh, sh_time, rows, elapsed, seen)
-    phases = 2 * math.pi * torch.arange(1, 4) * elapsed[:, None]
+    phases = 2 * math.pi * torch.arange(1, 4).double() * elapsed[:, None]
     amplitudes = sh_time[rows].view(4, 3, num_terms, 3) * phases.cos()[:, :, None, None]
     expected = sh + amplitudes.sum(1) * seen[:, None, None]
     torch.testing.assert_close(found, expected)
