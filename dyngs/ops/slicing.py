@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import reduce
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -82,7 +83,7 @@ def slice_gaussians(
     check_number("min_weight", min_weight, 0, 1)
     limit = min(_LARGEST_EXPONENT, -math.log(min_weight)) if min_weight > 0 else _LARGEST_EXPONENT
     tensors = means, times, quats, right_quats, log_scales, log_spans, logit_opacities
-    return slicing_op(*_as_one_dtype(*tensors), float(time), limit)[:4]
+    return cast(Any, slicing_op)(*_as_one_dtype(*tensors), float(time), limit)[:4]
 
 
 def _as_one_dtype(*tensors: Tensor) -> list[Tensor]:
