@@ -17,9 +17,7 @@ from dyngs.deform.networks import encode_frequencies
 from dyngs.gaussians.optimizer import Parameters
 from dyngs.ops.perceptron import Layer, perceptron
 
-OCTAVES = (
-    6  # of all encodings: 39 numbers of a direction and 13 of a time, as in the paper's figure
-)
+OCTAVES = 6  # of all encodings; 39 numbers of a direction and 13 of a time, as in a figure
 BRANCHES = {"means": 4, "directions": 3, "times": 1}  # inputs before their encoding
 FEATURES = 30  # outputs of each branch
 NUM_FACTORS = 16
