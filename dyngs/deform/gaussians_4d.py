@@ -8,13 +8,12 @@ harmonics times a cosine series in time. Slicing is one operation of the kernels
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from dyngs.core.conventions import MAX_SH_DEGREE, num_sh_terms
 from dyngs.core.state import Role
 from dyngs.deform import predictor
 from dyngs.deform.field import (
@@ -255,15 +254,6 @@ class Gaussians4D(DeformationField):
 
     def apply_edit(self, edit: TopologyEdit) -> Gaussians4D:
         return self.with_parameters(self.parameters.apply_edit(Role.PER_MOVING, edit))
-
-    def with_state(self, tensors: Mapping[str, Tensor]) -> Gaussians4D:
-        stored = tensors.get("learned.sh_time")
-        terms = 0 if stored is None else stored.shape[1] // max(self.options.frequencies, 1)
-        if terms > num_sh_terms(MAX_SH_DEGREE):
-            raise ValueError(f"'sh_time' has an invalid number of coefficients ({terms})")
-        setup = replace(self.setup, num_sh_terms=terms)
-        field = Gaussians4D(self.options, setup, torch.Generator())
-        return super(Gaussians4D, field).with_state(tensors)
 
     def _untrained(self, centers: Tensor, spans: Tensor, right_quats: Tensor) -> Parameters:
         tensors = {

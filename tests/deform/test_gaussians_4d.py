@@ -103,7 +103,7 @@ def test_halves_are_drawn_from_the_density_over_space_and_time() -> None:
     right = unit_quats(field.parameters["right_quats"])
     axes = quat_product(quat_product(unit_quats(one.quats), torch.diag(scales[0])), right)
     expected = (axes.mT @ axes).detach().double()
-    torch.testing.assert_close(points.T.cov(), expected, rtol=0, atol=0.03 * expected.max())
+    torch.testing.assert_close(points.T.cov(), expected, rtol=0, atol=0.03 * float(expected.max()))
     center = torch.cat([field.parameters["times"], one.means], 1).detach().double()
     error = (points.mean(0) - center[0]) / expected.diagonal().sqrt()
     assert error.abs().max() < 5 / math.sqrt(count)
@@ -163,7 +163,7 @@ def test_broken_tensors_are_refused(
     for name, edit in change.items():
         tensors[f"learned.{name}"] = edit(tensors[f"learned.{name}"])
     with pytest.raises(ValueError, match=reason):
-        restore_field(field.options, tensors, 9)
+        restore_field(field.options, tensors, 9, 4)
 
 
 def grown(config: Config, threshold: float) -> int:

@@ -183,12 +183,14 @@ def test_weights_decay_towards_zero() -> None:
 def test_a_stored_predictor_gives_the_same_gaussians() -> None:
     field = trained_field()
     state = strip_roles(field_state(field))
-    restored = restore_field(OPTIONS, state, COUNT)
+    restored = restore_field(OPTIONS, state, COUNT, 4)
     assert isinstance(restored, Gaussians4D)
     for name, x in at(field, cloud()).tensors().items():
         assert torch.equal(at(restored, cloud()).tensors()[name], x)
     with pytest.raises(KeyError):
-        restore_field(OPTIONS, {n: x for n, x in state.items() if "joined_bias2" not in n}, COUNT)
+        restore_field(
+            OPTIONS, {n: x for n, x in state.items() if "joined_bias2" not in n}, COUNT, 4
+        )
 
 
 def test_a_stored_scene_keeps_each_number_of_the_rotations() -> None:
