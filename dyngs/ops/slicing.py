@@ -94,7 +94,8 @@ def _as_one_dtype(*tensors: Tensor) -> list[Tensor]:
 def _conditioning(
     quats: Tensor, right_quats: Tensor, log_scales: Tensor, log_spans: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    velocities, log_stds = empty_like(log_scales), empty_like(log_spans)
+    velocities = empty_like(log_scales)
+    log_stds = empty_like(log_spans)
     results = empty_like(quats), empty_like(log_scales), velocities, log_stds
     shapes = quats, right_quats, log_scales, log_spans
     launch(quats, "condition", shapes, (velocities, *results[:2], log_stds))

@@ -129,7 +129,7 @@ def test_a_slice_is_the_schur_complement(isa: str, dtype: torch.dtype) -> None:
 def test_extremes_are_exact(
     axes: tuple[float, ...], still: bool, span: float, dtype: torch.dtype, tolerance: float
 ) -> None:
-    """Lives of 1e-6 to 1e6 clips, at up to two standard deviations of time.
+    """Spans are 1e-6 to 1e6 clips; times are within two standard deviations.
 
     Two axes of a moving ball are equal, where gradients by scales are not exact.
     """
