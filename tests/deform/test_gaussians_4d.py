@@ -1,4 +1,4 @@
-"""4D Gaussians: known shapes and lifetimes, splits and growth in time, storage, exports, quality."""
+"""4D Gaussians: known shapes and lifetimes, splits and growth in time, storage, exports, PSNR."""
 
 from __future__ import annotations
 
