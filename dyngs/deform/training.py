@@ -185,8 +185,10 @@ class DynamicTraining(SceneTraining[DynamicScene]):
     def split_in_time(
         self, scene: DynamicScene, result: EditResult, generator: torch.Generator
     ) -> EditResult:
-        is_split = isinstance(scene.field, Gaussians4D) and "means" in result.changes
-        if not is_split or result.edit is None or scene.is_static:
+        field = scene.field
+        if not isinstance(field, Gaussians4D) or result.edit is None:
+            return result
+        if "means" not in result.changes or scene.is_static:
             return result
         position = torch.full((len(scene),), -1, device=scene.device)
         position[scene.moving] = torch.arange(len(scene.moving), device=scene.device)
@@ -196,12 +198,12 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         children = torch.nonzero(shrunk & (origin >= 0))[:, 0]
         source = result.edit.source[children]
         gaussians = scene.gaussians.detach().select(source)
-        means, changes = scene.field.split(gaussians, origin[children], generator)
+        means, changes = field.split(gaussians, origin[children], generator)
         moved = result.changes["means"].clone()
         moved[children] = means
-        fill = {}
+        fill: dict[str, Tensor] = {}
         for name, values in changes.items():
-            fill[name] = scene.field.parameters[name].detach()[origin.clamp_min(0)]
+            fill[name] = field.parameters[name].detach()[origin.clamp_min(0)]
             fill[name][children] = values
         return replace(result, changes=result.changes | {"means": moved}, motion_changes=fill)
 
