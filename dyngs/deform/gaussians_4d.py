@@ -31,7 +31,12 @@ from dyngs.gaussians.densify import SPLIT_SHRINK
 from dyngs.gaussians.optimizer import Parameters
 from dyngs.ops.adam import Count
 from dyngs.ops.quaternions import identity_quat, quat_product, unit_quats
-from dyngs.ops.slicing import condition_gaussians, slice_gaussians
+from dyngs.ops.slicing import (
+    FADED_LOGIT,
+    condition_gaussians,
+    harmonics_in_time,
+    slice_gaussians,
+)
 
 LR_QUATS = 1e-3  # learning rate of the right quaternions, that of 3DGS for rotations
 LR_SH = 0.0025 / 20  # learning rate of SH coefficients over time, that of 3DGS above degree 0
@@ -120,7 +125,8 @@ class Gaussians4D(DeformationField):
             time,
             MIN_WEIGHT,
         )
-        drawn = Gaussians(*sliced, self._colours(own.sh, time - times, moving.visible))
+        sh = self._colours(own.sh, time - times, sliced[3], moving.visible)
+        drawn = Gaussians(*sliced, sh)
         if moving.rows is None:
             return DeformedGaussians(drawn)
         tensors = gaussians.tensors()
@@ -197,15 +203,14 @@ class Gaussians4D(DeformationField):
         curvature = (squares - 1) * (-0.5 * squares - 2 * log_stds.clamp_min(-300)).exp()
         return OpacityWindow(curvature, self.parameters["log_spans"][:, 0].double())
 
-    def _colours(self, sh: Tensor, elapsed: Tensor, visible: Tensor | None) -> Tensor:
+    def _colours(
+        self, sh: Tensor, elapsed: Tensor, logits: Tensor, visible: Tensor | None
+    ) -> Tensor:
         """Return SH coefficients (A, K, 3), ``elapsed`` (A, 1) clips after the mean times."""
         if "sh_time" not in self.parameters:
             return sh
-        terms = select_rows(self.parameters["sh_time"], visible).split(sh.shape[1], dim=1)
-        for order, amplitude in enumerate(terms, 1):
-            phase = (2 * math.pi * order) * elapsed[:, :, None]
-            sh = torch.addcmul(sh, phase.cos(), amplitude)
-        return sh
+        is_seen = logits.detach() > FADED_LOGIT
+        return harmonics_in_time(sh, self.parameters["sh_time"], visible, elapsed[:, 0], is_seen)
 
     @torch.no_grad()
     def storage_quats(self, quats: Tensor) -> tuple[Tensor, Tensor]:
