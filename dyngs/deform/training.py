@@ -225,8 +225,7 @@ class DynamicTraining(SceneTraining[DynamicScene]):
             scene.field.invalidate()
         scene.field.extend(self._window.bounds(step), self._window.bounds(step + 1))
         scene = self._add_windows(scene, step)
-        freezes = step in self.schedule.freeze_steps and scene.field.can_freeze
-        return self._freeze_static(scene) if freezes else scene
+        return self._freeze_static(scene) if step in self.schedule.freeze_steps else scene
 
     def edit_scene(self, scene: DynamicScene, step: int) -> tuple[DynamicScene, EditResult] | None:
         """Add the Gaussians that motion starts with; None if a static model explains all images."""
@@ -352,7 +351,7 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         """Freeze the Gaussians whose motion is too small to be visible."""
         field = scene.field
         now = scene.gaussians.detach()
-        if field is None:
+        if field is None or not field.can_freeze:
             return scene
         px_size = filter_std(now.means, self.capture.cameras)[scene.moving] / math.sqrt(
             FILTER_VARIANCE
