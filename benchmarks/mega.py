@@ -55,6 +55,7 @@ PARTS: dict[str, tuple[str, ...]] = {
     "deformation": ("model.deform.predictor_width=256",),
 }
 ONLY_4D = ("deformation",)
+WITH_WAVES = ("model.deform.frequencies=2",)  # 16 harmonics x 3 channels x 3 terms in time
 FILES = ("half and zip", ".dyngs")
 
 
@@ -84,7 +85,8 @@ class Row:
         """Overrides of this part and of those before."""
         parts = list(PARTS)
         own = parts[: parts.index(self.part) + 1]
-        return [word for part in own for word in PARTS[part] if self.has(part)]
+        words = [word for part in own for word in PARTS[part] if self.has(part)]
+        return [*words, *(WITH_WAVES if self.system == "gaussians_4d" else ())]
 
     def has(self, part: str) -> bool:
         return part not in ONLY_4D or self.system == "gaussians_4d"

@@ -32,7 +32,7 @@ from dyngs.ops.rays import MarchSteps, Rays, Space, composite, march, reached
 from dyngs.ops.registration import count_nonfinite_op
 from dyngs.ops.shading import shading_inputs
 from dyngs.ops.skinning import add_offsets_, blend_skinning, offset_gradients
-from dyngs.ops.slicing import condition_gaussians, slice_gaussians
+from dyngs.ops.slicing import condition_gaussians, harmonics_in_time, slice_gaussians
 
 
 @dataclass(frozen=True)
@@ -230,11 +230,17 @@ def slicing_case(count: int, dtype: torch.dtype) -> Case:
     numbers = Numbers(dtype)
     sizes = (3,), (), (4,), (4,), (3,), (), ()
     inputs = [leaf(numbers.normal(count, *size)) for size in sizes]
+    colours = [leaf(numbers.normal(count, size, 3)) for size in (4, 8)]
+    rows = torch.arange(count).flip(0)
 
     def run(*inputs: Tensor) -> list[Tensor]:
-        return [*slice_gaussians(*inputs, time=0.3), *condition_gaussians(*inputs[2:6])]
+        sliced = slice_gaussians(*inputs[:7], time=0.3)
+        elapsed = 0.3 - inputs[1]
+        seen = sliced[3].detach() > -100
+        colours = [harmonics_in_time(*inputs[7:], x, elapsed, seen) for x in (None, rows)]
+        return [*sliced, *condition_gaussians(*inputs[2:6]), *colours]
 
-    return Case(run, tuple(inputs))
+    return Case(run, (*inputs, *colours))
 
 
 def perceptron_case(count: int, dtype: torch.dtype, skip: int | None = 2) -> Case:

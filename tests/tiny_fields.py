@@ -41,7 +41,7 @@ def tiny_options(kind: str, *, everything: bool = True) -> DeformField:
     if kind == "free":
         return FreeField()
     if kind == "gaussians_4d":
-        return Gaussians4DField()
+        return Gaussians4DField(frequencies=2)
     return MlpField(depth=2, width=8, moves=moves)
 
 

@@ -1,4 +1,6 @@
 // Python bindings of the slicing of 4D Gaussians. Argument unpacking only.
+#include <algorithm>
+
 #include "bind/arrays.hpp"
 #include "core/api.hpp"
 
@@ -89,6 +91,51 @@ void condition_arrays(const RotationsAndScales<const S>& shapes, const SliceArra
   condition(in, out, threads);
 }
 
+// Harmonics (A, K, 3) and (M, N K, 3), rows of the latter, elapsed times, and what is seen.
+template <class S>
+using TimeHarmonicsArrays = std::tuple<Array<const S, nb::ndim<3>>, Array<const S, nb::ndim<3>>,
+                                       MaybeArray<const int64_t>, Array<const S>, Array<const bool>>;
+
+template <class S>
+TimeHarmonics<S> time_harmonics_input(const TimeHarmonicsArrays<S>& arrays) {
+  const auto& [sh, sh_time, rows, elapsed, seen] = arrays;
+  const int64_t count = sh.shape(0), width = sh.shape(1) * sh.shape(2), stored = sh_time.shape(0);
+  const int64_t size = sh_time.shape(1) * sh_time.shape(2);
+  if (width == 0 || size % width != 0) throw nb::value_error("harmonics in time: arrays of different sizes");
+  const auto wrong = [stored](int64_t row) { return row < 0 || row >= stored; };
+  const bool all_exist =
+      rows ? kOnGpu || std::none_of(rows->data(), rows->data() + rows->size(), wrong) : count <= stored;
+  if (!all_exist) throw nb::index_error("harmonics in time: no such row");
+  return {count,
+          width,
+          size / width,
+          sh.data(),
+          sh_time.data(),
+          checked(rows, count, "harmonics in time: rows"),
+          checked(elapsed, count, "harmonics in time: elapsed"),
+          checked(seen, count, "harmonics in time: seen")};
+}
+
+template <class S>
+void time_harmonics_arrays(const TimeHarmonicsArrays<S>& arrays, const Array<S>& out, int threads) {
+  const TimeHarmonics<S> in = time_harmonics_input<S>(arrays);
+  S* to = checked(out, in.count * in.width, "harmonics in time: out");
+  nb::gil_scoped_release release;
+  time_harmonics(in, to, threads);
+}
+
+template <class S>
+void time_harmonics_backward_arrays(const TimeHarmonicsArrays<S>& arrays, const Array<const S>& g,
+                                    const Array<S>& by_sh_time, const Array<S>& by_elapsed, int threads) {
+  const TimeHarmonics<S> in = time_harmonics_input<S>(arrays);
+  const S* by = checked(g, in.count * in.width, "harmonics in time: g");
+  const int64_t stored = std::get<1>(arrays).size();
+  S* to = checked(by_sh_time, stored, "harmonics in time: by_sh_time");
+  S* to_elapsed = checked(by_elapsed, in.count, "harmonics in time: by_elapsed");
+  nb::gil_scoped_release release;
+  time_harmonics_backward(in, by, to, to_elapsed, threads);
+}
+
 template <class S>
 void bind_slicing_of(nb::module_& module) {
   module.def("slice_forward", slice_forward_arrays<S>, array("gaussians"), nb::arg("time"), nb::arg("most_faded"),
@@ -102,6 +149,11 @@ void bind_slicing_of(nb::module_& module) {
   module.def("condition", condition_arrays<S>, array("shapes"), array("outputs"), nb::arg("num_threads"),
              "Writes velocities (M, 3), quaternions (M, 4), log scales (M, 3) and log standard deviations of time "
              "(M,), from quaternions, right quaternions, log scales and log spans.");
+  module.def("time_harmonics", time_harmonics_arrays<S>, array("harmonics"), array("out"), nb::arg("num_threads"),
+             "Writes harmonics (A, K, 3) at a time.");
+  module.def("time_harmonics_backward", time_harmonics_backward_arrays<S>, array("harmonics"), array("g"),
+             array("by_sh_time"), array("by_elapsed"), nb::arg("num_threads"),
+             "Writes gradients by the cosines' coefficients, in the named rows, and by the elapsed times.");
 }
 
 }  // namespace

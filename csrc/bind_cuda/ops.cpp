@@ -169,6 +169,17 @@ void condition(const SpaceTimeGaussians<float>& in, const Conditional<float>& ou
 }
 
 template <>
+void time_harmonics(const TimeHarmonics<float>& in, float* out, int) {
+  cuda::time_harmonics(in, out, current_stream());
+}
+
+template <>
+void time_harmonics_backward(const TimeHarmonics<float>& in, const float* g, float* by_sh_time, float* by_elapsed,
+                             int) {
+  cuda::time_harmonics_backward(in, g, by_sh_time, by_elapsed, current_stream());
+}
+
+template <>
 void add_offsets(const RowOffsets<float>& offsets, const MovedGaussians<float>& gaussians, int) {
   cuda::add_offsets(offsets, gaussians, current_stream());
 }

@@ -447,6 +447,25 @@ struct Conditional {
 template <class S>
 void condition(const SpaceTimeGaussians<S>& in, const Conditional<S>& out, int threads);
 
+// Coefficients of harmonics that change over time, sh + sum_n cos(2 pi n elapsed) sh_time_n.
+template <class S>
+struct TimeHarmonics {
+  int64_t count, width, waves;  // A, numbers per Gaussian 3 K, cosines
+  const S* sh;                  // (A, width)
+  const S* sh_time;             // (M, waves, width)
+  const int64_t* rows;          // (A,) of sh_time, none twice; null: the first A
+  const S* elapsed;             // (A,)
+  const bool* seen;             // (A,); others keep sh
+};
+
+// Writes (A, width).
+template <class S>
+void time_harmonics(const TimeHarmonics<S>& in, S* out, int threads);
+
+// Writes `by_sh_time` in the rows of A, zero where not seen, and `by_elapsed` (A,), from the gradient `g` (A, width).
+template <class S>
+void time_harmonics_backward(const TimeHarmonics<S>& in, const S* g, S* by_sh_time, S* by_elapsed, int threads);
+
 // Offsets of a deformation field (dyngs/deform has the formulas in torch) -----------------------------------------------
 
 // Of M rows; null: no change of that.

@@ -1,6 +1,9 @@
 // Slicing of 4D Gaussians, as many at a time as a register holds.
 #include "math/slicing.hpp"
 #include "core/api.hpp"
+
+#include <algorithm>
+
 #include "cpu/lanes.hpp"
 #include "cpu/parallel.hpp"
 #include "cpu/simd.hpp"
@@ -50,6 +53,18 @@ SpaceTime<Native<S>> load_space_time(const SpaceTimeGaussians<S>& in, int64_t fi
   const Vec3<Native<S>> logs = load3(in.log_scales, first, count);
   const Native<S> log_scales[4] = {logs.x, logs.y, logs.z, load1(in.log_spans, first, count)};
   return space_time(load4(in.quats, first, count), load4(in.right_quats, first, count), log_scales);
+}
+
+// sum_j a_j b_j.
+template <class S>
+S product_sum(const S* a, const S* b, int64_t count) {
+  constexpr int kSize = Native<S>::kSize;
+  Native<S> sums(S(0));
+  int64_t j = 0;
+  for (; j + kSize <= count; j += kSize) sums += Native<S>::load(a + j) * Native<S>::load(b + j);
+  S sum = horizontal_sum(sums);
+  for (; j < count; ++j) sum += a[j] * b[j];
+  return sum;
 }
 
 // f(first, count) for every group of lanes.
@@ -118,11 +133,51 @@ void condition(const SpaceTimeGaussians<S>& in, const Conditional<S>& out, int t
   });
 }
 
+template <class S>
+void time_harmonics(const TimeHarmonics<S>& in, S* out, int threads) {
+  parallel_for(in.count, kBlock, threads, [&](int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; ++i) {
+      S* to = out + i * in.width;
+      std::copy_n(in.sh + i * in.width, in.width, to);
+      if (!in.seen[i]) continue;
+      const S* amplitude = in.sh_time + (in.rows ? in.rows[i] : i) * in.waves * in.width;
+      const Wave<S> first = first_wave(in.elapsed[i]);
+      Wave<S> wave = first;
+      for (int64_t n = 0; n < in.waves; ++n, amplitude += in.width, wave = next_wave(wave, first))
+        for (int64_t j = 0; j < in.width; ++j) to[j] += wave.cosine * amplitude[j];
+    }
+  });
+}
+
+template <class S>
+void time_harmonics_backward(const TimeHarmonics<S>& in, const S* g, S* by_sh_time, S* by_elapsed, int threads) {
+  parallel_for(in.count, kBlock, threads, [&](int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; ++i) {
+      const int64_t row = (in.rows ? in.rows[i] : i) * in.waves * in.width;
+      const S *by = g + i * in.width, *amplitude = in.sh_time + row;
+      S* to = by_sh_time + row;
+      by_elapsed[i] = 0;
+      if (!in.seen[i]) {
+        std::fill_n(to, in.waves * in.width, S(0));
+        continue;
+      }
+      const Wave<S> first = first_wave(in.elapsed[i]);
+      Wave<S> wave = first;
+      for (int64_t n = 1; n <= in.waves; ++n, amplitude += in.width, to += in.width, wave = next_wave(wave, first)) {
+        by_elapsed[i] -= S(6.283185307179586) * S(n) * wave.sine * product_sum(by, amplitude, in.width);
+        for (int64_t j = 0; j < in.width; ++j) to[j] = wave.cosine * by[j];
+      }
+    }
+  });
+}
+
 #define DYNGS_INSTANTIATE(S)                                                                                \
   template void slice_forward<S>(const SpaceTimeGaussians<S>&, const SliceTime<S>&, const Slice<S>&, int);  \
   template void slice_backward<S>(const SpaceTimeGaussians<S>&, const SliceTime<S>&, const Slice<const S>&, \
                                   const SliceGrads<S>&, const SpaceTimeGrads<S>&, int);                     \
-  template void condition<S>(const SpaceTimeGaussians<S>&, const Conditional<S>&, int);
+  template void condition<S>(const SpaceTimeGaussians<S>&, const Conditional<S>&, int);                     \
+  template void time_harmonics<S>(const TimeHarmonics<S>&, S*, int);                                        \
+  template void time_harmonics_backward<S>(const TimeHarmonics<S>&, const S*, S*, S*, int);
 DYNGS_INSTANTIATE(float)
 DYNGS_INSTANTIATE(double)
 #undef DYNGS_INSTANTIATE

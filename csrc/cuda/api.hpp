@@ -108,6 +108,9 @@ void slice_forward(const SpaceTimeGaussians<float>& in, const SliceTime<float>& 
 void slice_backward(const SpaceTimeGaussians<float>& in, const SliceTime<float>& at, const Slice<const float>& slice,
                     const SliceGrads<float>& g, const SpaceTimeGrads<float>& out, Stream stream);
 void condition(const SpaceTimeGaussians<float>& in, const Conditional<float>& out, Stream stream);
+void time_harmonics(const TimeHarmonics<float>& in, float* out, Stream stream);
+void time_harmonics_backward(const TimeHarmonics<float>& in, const float* g, float* by_sh_time, float* by_elapsed,
+                             Stream stream);
 
 void nodes_at(const NodeSplines<float>& splines, float* motion, float* values, Stream stream);
 void nodes_at_backward(const NodeSplines<float>& splines, const float* by_motion, const float* by_values,

@@ -56,6 +56,10 @@ DYNGS_INLINE float log2(float x) { return std::log2(x); }
 DYNGS_INLINE double log2(double x) { return std::log2(x); }
 DYNGS_INLINE float exp2(float x) { return std::exp2(x); }
 DYNGS_INLINE double exp2(double x) { return std::exp2(x); }
+DYNGS_INLINE float cos(float x) { return std::cos(x); }
+DYNGS_INLINE double cos(double x) { return std::cos(x); }
+DYNGS_INLINE float sin(float x) { return std::sin(x); }
+DYNGS_INLINE double sin(double x) { return std::sin(x); }
 DYNGS_INLINE float ceil(float x) { return std::ceil(x); }
 DYNGS_INLINE double ceil(double x) { return std::ceil(x); }
 DYNGS_INLINE float trunc(float x) { return std::trunc(x); }

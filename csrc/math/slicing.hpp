@@ -285,4 +285,22 @@ DYNGS_HD SpaceTimeGrad<R> slice_vjp(const SpaceTime<R>& f, const SlicedShape<R>&
   return out;
 }
 
+// cos(2 pi n x) and sin(2 pi n x).
+template <class R>
+struct Wave {
+  R cosine, sine;
+};
+
+// n = 1, of a number: whole periods are left out exactly.
+template <class S>
+DYNGS_HD Wave<S> first_wave(S x) {
+  const S phase = S(6.283185307179586) * (x - trunc(x));
+  return {cos(phase), sin(phase)};
+}
+
+template <class R>
+DYNGS_HD Wave<R> next_wave(const Wave<R>& wave, const Wave<R>& first) {
+  return {wave.cosine * first.cosine - wave.sine * first.sine, wave.sine * first.cosine + wave.cosine * first.sine};
+}
+
 }  // namespace dyngs

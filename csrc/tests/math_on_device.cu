@@ -133,6 +133,8 @@ __global__ void slicing(Numbers<S> n) {
   const SliceGrad<S> g{n.vec(), n.quat(), {n.next(), n.next(), n.next()}, n.next()};
   const SpaceTimeGrad<S> by = slice_vjp(f, shape, n.next(), n.next(), limit, g);
   n.put(sliced_mean(by.mean, f.velocity, by.time)), n.put(by.left), n.put(by.right), n.put(log_deviation(f));
+  const Wave<S> wave = first_wave(n.next());
+  n.put(next_wave(wave, wave).sine);
 }
 
 template <class S>

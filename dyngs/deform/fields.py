@@ -130,16 +130,16 @@ def field_state(field: DeformationField) -> State:
 
 
 def restore_field(
-    options: DeformField, tensors: Mapping[str, Tensor], num_moving: int
+    options: DeformField, tensors: Mapping[str, Tensor], num_moving: int, num_sh_terms: int = 0
 ) -> DeformationField:
-    """Return the field in a checkpoint for M moving Gaussians."""
+    """Return the field in a checkpoint for M moving Gaussians with K harmonics each."""
     num_times, extent = require_positive(
         "numbers", require_tensor("numbers", tensors["numbers"], (2,), None)
     ).tolist()
     center, half_size = require_tensor("box", tensors["box"], (2, 3))
-    setup = FieldSetup(
-        center, require_positive("box", half_size), int(num_times), num_moving, extent
-    )
+    require_positive("box", half_size)
+    num_sh_terms = num_sh_terms if "learned.sh_time" in tensors else 0
+    setup = FieldSetup(center, half_size, int(num_times), num_moving, extent, num_sh_terms)
     field = create_field(options, setup, torch.Generator()).with_state(tensors)
     bodies = select_prefix(tensors, "bodies")
     field = BodyField.from_state(field, bodies) if bodies else field

@@ -8,13 +8,12 @@ harmonics times a cosine series in time. Slicing is one operation of the kernels
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from dyngs.core.conventions import MAX_SH_DEGREE, num_sh_terms
 from dyngs.core.state import Role
 from dyngs.deform import predictor
 from dyngs.deform.field import (
@@ -32,7 +31,12 @@ from dyngs.gaussians.densify import SPLIT_SHRINK
 from dyngs.gaussians.optimizer import Parameters
 from dyngs.ops.adam import Count
 from dyngs.ops.quaternions import identity_quat, quat_product, unit_quats
-from dyngs.ops.slicing import condition_gaussians, slice_gaussians
+from dyngs.ops.slicing import (
+    FADED_LOGIT,
+    condition_gaussians,
+    harmonics_in_time,
+    slice_gaussians,
+)
 
 LR_QUATS = 1e-3  # learning rate of the right quaternions, that of 3DGS for rotations
 LR_SH = 0.0025 / 20  # learning rate of SH coefficients over time, that of 3DGS above degree 0
@@ -121,7 +125,8 @@ class Gaussians4D(DeformationField):
             time,
             MIN_WEIGHT,
         )
-        drawn = Gaussians(*sliced, self._colours(own.sh, time - times, moving.visible))
+        sh = self._colours(own.sh, time - times, sliced[3], moving.visible)
+        drawn = Gaussians(*sliced, sh)
         if moving.rows is None:
             return DeformedGaussians(drawn)
         tensors = gaussians.tensors()
@@ -198,15 +203,14 @@ class Gaussians4D(DeformationField):
         curvature = (squares - 1) * (-0.5 * squares - 2 * log_stds.clamp_min(-300)).exp()
         return OpacityWindow(curvature, self.parameters["log_spans"][:, 0].double())
 
-    def _colours(self, sh: Tensor, elapsed: Tensor, visible: Tensor | None) -> Tensor:
+    def _colours(
+        self, sh: Tensor, elapsed: Tensor, logits: Tensor, visible: Tensor | None
+    ) -> Tensor:
         """Return SH coefficients (A, K, 3), ``elapsed`` (A, 1) clips after the mean times."""
         if "sh_time" not in self.parameters:
             return sh
-        terms = select_rows(self.parameters["sh_time"], visible).split(sh.shape[1], dim=1)
-        for order, amplitude in enumerate(terms, 1):
-            phase = (2 * math.pi * order) * elapsed[:, :, None]
-            sh = torch.addcmul(sh, phase.cos(), amplitude)
-        return sh
+        is_seen = logits.detach() > FADED_LOGIT
+        return harmonics_in_time(sh, self.parameters["sh_time"], visible, elapsed[:, 0], is_seen)
 
     @torch.no_grad()
     def storage_quats(self, quats: Tensor) -> tuple[Tensor, Tensor]:
@@ -255,15 +259,6 @@ class Gaussians4D(DeformationField):
 
     def apply_edit(self, edit: TopologyEdit) -> Gaussians4D:
         return self.with_parameters(self.parameters.apply_edit(Role.PER_MOVING, edit))
-
-    def with_state(self, tensors: Mapping[str, Tensor]) -> Gaussians4D:
-        stored = tensors.get("learned.sh_time")
-        terms = 0 if stored is None else stored.shape[1] // max(self.options.frequencies, 1)
-        if terms > num_sh_terms(MAX_SH_DEGREE):
-            raise ValueError(f"'sh_time' has an invalid number of coefficients ({terms})")
-        setup = replace(self.setup, num_sh_terms=terms)
-        field = Gaussians4D(self.options, setup, torch.Generator())
-        return super(Gaussians4D, field).with_state(tensors)
 
     def _untrained(self, centers: Tensor, spans: Tensor, right_quats: Tensor) -> Parameters:
         tensors = {

@@ -157,9 +157,10 @@ class Gaussians4DField(Section):
         description="each moving Gaussian has a covariance over space and time (4D Gaussians, Yang et al.)",
     )
     frequencies: int = Field(
-        default=2,
+        default=0,
         ge=0,
-        description="cosines in time of each spherical harmonic; 0: colours do not change; ignored by colour networks",
+        description="cosines in time of each spherical harmonic; 0: colours do not change; "
+        "published: 2; ignored by colour networks",
     )
     lr_times: Positive = Field(
         default=0.01, description="learning rate of the mean times, in time steps of the capture"
@@ -167,9 +168,10 @@ class Gaussians4DField(Section):
     lr_spans: Positive = Field(
         default=5e-3, description="learning rate of the logarithms of the scales along time"
     )
-    time_grad_threshold: Positive = Field(
-        default=5e-6,
-        description="mean gradient by the mean time, in clips, above which Gaussians are cloned or split",
+    time_grad_threshold: Positive | None = Field(
+        default=None,
+        description="mean gradient by the mean time, in clips, above which Gaussians are cloned or "
+        "split; published: 5e-6; null: only the gradient of the 2D means counts",
     )
     predictor_width: int = Field(
         default=0,

@@ -7,7 +7,6 @@ of octaves, the widths after the branches and the centre of the products are our
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from itertools import pairwise
 
 import torch
@@ -18,29 +17,21 @@ from dyngs.deform.networks import encode_frequencies
 from dyngs.gaussians.optimizer import Parameters
 from dyngs.ops.perceptron import Layer, perceptron
 
-OCTAVES = (
-    6  # of all encodings: 39 numbers of a direction and 13 of a time, as in the paper's figure
-)
+OCTAVES = 6  # of all encodings; 39 numbers of a direction and 13 of a time, as in a figure
 BRANCHES = {"means": 4, "directions": 3, "times": 1}  # inputs before their encoding
-BRANCH_OUTPUTS = 30
+FEATURES = 30  # outputs of each branch
 NUM_FACTORS = 16
 LR, LR_DECAY = 8e-4, 0.002  # first learning rate, and ratio of the last to it
 WEIGHT_DECAY = 1e-6
 
 
-def _widths(width: int) -> Mapping[str, list[int]]:
-    """Return the layer widths of each branch and of the layers that join them."""
-    branches = {
-        name: [size * (1 + 2 * OCTAVES), width, BRANCH_OUTPUTS] for name, size in BRANCHES.items()
-    }
-    return branches | {"joined": [BRANCH_OUTPUTS * len(BRANCHES), width, width, NUM_FACTORS]}
-
-
 def start_values(width: int, generator: torch.Generator) -> dict[str, Tensor]:
     """Return Glorot weights and zero biases; the last layer is zero, so that all factors are 1."""
+    widths = {name: [x * (1 + 2 * OCTAVES), width, FEATURES] for name, x in BRANCHES.items()}
+    widths["joined"] = [FEATURES * len(BRANCHES), width, width, NUM_FACTORS]
     values: dict[str, Tensor] = {}
-    for name, widths in _widths(width).items():
-        for i, (fan_in, fan_out) in enumerate(pairwise(widths)):
+    for name, sizes in widths.items():
+        for i, (fan_in, fan_out) in enumerate(pairwise(sizes)):
             values[f"{name}_weight{i}"] = glorot(fan_in, fan_out, generator)
             values[f"{name}_bias{i}"] = torch.zeros(fan_out, device="cpu")
     values["joined_weight2"].zero_()
@@ -57,29 +48,21 @@ def predict_changes(
     Args:
         means: (M, 3) means, -1 to 1 in the box of the motion.
         times: (M, 1) mean times in clips.
-        directions: (M, 3) unit vectors from the camera; None: a view from nowhere, whose encoding
-            is zero.
+        directions: (M, 3) unit vectors from the camera; None: no camera, with a zero encoding.
         now: (1, 1), or (M, 1) with a time for each Gaussian.
     """
 
-    def branch(name: str, inputs: Tensor) -> Tensor:
-        return perceptron(inputs, _layers(parameters, name, 2))
+    def evaluate(name: str, x: Tensor, num_layers: int = 2) -> Tensor:
+        layers = [
+            Layer(parameters[f"{name}_weight{i}"], parameters[f"{name}_bias{i}"])
+            for i in range(num_layers)
+        ]
+        return perceptron(x, layers).expand(len(means), -1)
 
-    def encoded(x: Tensor) -> Tensor:
-        return encode_frequencies(x, OCTAVES)
-
-    count = len(means)
-    no_view = means.new_zeros(1, BRANCHES["directions"] * (1 + 2 * OCTAVES))
-    views = no_view if directions is None else encoded(directions)
-    features = [
-        branch("means", encoded(torch.cat([means, 2 * times - 1], dim=1))),
-        branch("directions", views).expand(count, -1),
-        branch("times", encoded(2 * now - 1)).expand(count, -1),
-    ]
-    return perceptron(torch.cat(features, dim=1), _layers(parameters, "joined", 3))
-
-
-def _layers(parameters: Parameters, name: str, count: int) -> list[Layer]:
-    return [
-        Layer(parameters[f"{name}_weight{i}"], parameters[f"{name}_bias{i}"]) for i in range(count)
-    ]
+    view = means[:1] if directions is None else directions
+    inputs = torch.cat([means, 2 * times - 1], dim=1), view, 2 * now - 1
+    encoded = [encode_frequencies(x, OCTAVES) for x in inputs]
+    if directions is None:
+        encoded[1] = torch.zeros_like(encoded[1])
+    features = [evaluate(name, x) for name, x in zip(BRANCHES, encoded, strict=True)]
+    return evaluate("joined", torch.cat(features, dim=1), 3)

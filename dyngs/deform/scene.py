@@ -47,7 +47,7 @@ class DynamicScene(GaussianScene):
         masks = VisibilityMasks.from_state(select_prefix(tensors, "masks"), count)
         rows = tensors.get("rows", torch.arange(count, device=gaussians.means.device))
         require_ascending("rows", require_indices("rows", rows, (None,), count))
-        field = restore_field(options.deform, own, len(rows))
+        field = restore_field(options.deform, own, len(rows), gaussians.sh.shape[1])
         if "left_quats" in own:
             left = require_tensor("left_quats", own["left_quats"], (len(rows), 4))
             gaussians = gaussians.replace(quats=gaussians.quats.index_copy(0, rows, left))

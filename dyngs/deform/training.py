@@ -175,8 +175,10 @@ class DynamicTraining(SceneTraining[DynamicScene]):
     def time_gradient(self, scene: DynamicScene) -> Tensor | None:
         if not isinstance(scene.field, Gaussians4D):
             return None
-        gradient = scene.gaussians.means.detach().new_zeros(len(scene))
         threshold = scene.field.options.time_grad_threshold
+        if threshold is None:
+            return None
+        gradient = scene.gaussians.means.detach().new_zeros(len(scene))
         gradient[scene.moving] = scene.field.time_gradient / threshold
         return gradient
 

@@ -192,7 +192,7 @@ def orbit_cameras_around(
 
 def framing_points(scene: Renderable, time: float | None = None) -> Tensor:
     """Return points (K, 3) to frame a scene: means of Gaussians, or corners of the bounding box."""
-    return scene.at(time).means if isinstance(scene, GaussianScene) else scene.bounds
+    return scene.means_at(time) if isinstance(scene, GaussianScene) else scene.bounds
 
 
 def frontal_cameras(opened: OpenedScene, size: tuple[int, int] = DEFAULT_SIZE) -> Cameras:

@@ -88,7 +88,7 @@ class GaussianScene(Renderable):
     @property
     def bounds(self) -> Tensor:
         """Box (2, 3) of the finite means at the first time; zero if there are none."""
-        means = self.at(None).means
+        means = self.means_at(None)
         means = means[means.isfinite().all(1)]
         return torch.stack([means.amin(0), means.amax(0)]) if len(means) else means.new_zeros(2, 3)
 
@@ -139,6 +139,13 @@ class GaussianScene(Renderable):
         """Return the Gaussians of ``time_step`` without gradients."""
         with torch.no_grad():
             return self.time_step(time).gaussians
+
+    def means_at(self, time: float | None) -> Tensor:
+        """Return the means (K, 3) of the Gaussians that exist at ``time``; if there are none, of
+        all."""
+        now = self.at(time)
+        exists = now.opacities > 0
+        return now.means[exists] if bool(exists.any()) else now.means
 
     def shader(self, now: GaussianTimeStep) -> Shader | None:
         """Return the shader at a time step; None if SH coefficients give the colours."""

@@ -11,12 +11,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import reduce
+from typing import Any, cast
 
 import torch
 from torch import Tensor
 
 from dyngs.ops.registration import Backward, check_number, empty_like, launch, register
 
+FADED_LOGIT = -1e4
+"""Opacity logit of Gaussians that are not seen at a time."""
 # Exponent of the smallest weight that float32 has room for.
 _LARGEST_EXPONENT = 80.0
 
@@ -80,7 +83,7 @@ def slice_gaussians(
     check_number("min_weight", min_weight, 0, 1)
     limit = min(_LARGEST_EXPONENT, -math.log(min_weight)) if min_weight > 0 else _LARGEST_EXPONENT
     tensors = means, times, quats, right_quats, log_scales, log_spans, logit_opacities
-    return slicing_op(*_as_one_dtype(*tensors), float(time), limit)[:4]
+    return cast(Any, slicing_op)(*_as_one_dtype(*tensors), float(time), limit)[:4]
 
 
 def _as_one_dtype(*tensors: Tensor) -> list[Tensor]:
@@ -91,7 +94,8 @@ def _as_one_dtype(*tensors: Tensor) -> list[Tensor]:
 def _conditioning(
     quats: Tensor, right_quats: Tensor, log_scales: Tensor, log_spans: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    velocities, log_stds = empty_like(log_scales), empty_like(log_spans)
+    velocities = empty_like(log_scales)
+    log_stds = empty_like(log_spans)
     results = empty_like(quats), empty_like(log_scales), velocities, log_stds
     shapes = quats, right_quats, log_scales, log_spans
     launch(quats, "condition", shapes, (velocities, *results[:2], log_stds))
@@ -111,3 +115,32 @@ def condition_gaussians(
     """
     shapes = _as_one_dtype(quats, right_quats, log_scales, log_spans)
     return conditioning_op(*(x.detach() for x in shapes))
+
+
+def _time_harmonics(
+    sh: Tensor, sh_time: Tensor, rows: Tensor | None, elapsed: Tensor, seen: Tensor
+) -> Tensor:
+    out = empty_like(sh)
+    launch(sh, "time_harmonics", (sh, sh_time, rows, elapsed, seen), out)
+    return out
+
+
+def _time_harmonics_backward(x: Backward) -> Sequence[Tensor]:
+    sh, sh_time, rows, elapsed, _ = x.inputs
+    (by,) = x.grads
+    by_sh_time = empty_like(sh_time) if rows is None else torch.zeros_like(sh_time)
+    by_sh_time[len(sh) :] = 0
+    by_elapsed = empty_like(elapsed)
+    launch(sh, "time_harmonics_backward", x.inputs, by, by_sh_time, by_elapsed)
+    return by.clone(), by_sh_time, by_elapsed
+
+
+harmonics_in_time = register(
+    "harmonics_in_time", _time_harmonics, _time_harmonics_backward, "sh sh_time elapsed"
+)
+"""Return ``sh`` (A, K, 3) plus sum_n cos(2 pi n elapsed) a_n with coefficients a_n (K, 3), of which
+``sh_time`` (M, N K, 3) holds N for each of M Gaussians.
+
+``rows`` (A,) int64 of ``sh_time``, none twice; None: the first A. ``elapsed`` (A,). Where ``seen``
+(A,) is False, ``sh`` is returned, and the other gradients are zero.
+"""

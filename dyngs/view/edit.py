@@ -156,8 +156,8 @@ class EditState:
 
     def select_region(self, region: Region, time: float | None, *, removes: bool) -> None:
         """Add the Gaussians with centres in a region of the scene at ``time``, or remove them."""
-        means = self.whole.scene.at(time).means.double().cpu().numpy()
-        self.select(torch.from_numpy(region.contains(means)), removes=removes)
+        inside = gaussians_in_region(region, self.whole.scene, times=[time])
+        self.select(inside, removes=removes)
 
     def invert(self) -> None:
         kept, selected = self.state

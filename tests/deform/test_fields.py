@@ -36,7 +36,7 @@ def test_restored_field_moves_gaussians_equally(kind: str) -> None:
         total(moved(field, gaussians, time)).backward()
     field.parameters.step(1, 0.0)
     state = {name: x.clone() for name, x in strip_roles(field_state(field)).items()}
-    again = restore_field(tiny_options(kind), state, 9)
+    again = restore_field(tiny_options(kind), state, 9, 4)
     same = again.setup
     assert torch.equal(same.center, setup.center)
     assert torch.equal(same.half_size, setup.half_size)
@@ -56,4 +56,4 @@ def test_missing_tensor_is_named(kind: str) -> None:
     state = strip_roles(field_state(tiny_field(kind)))
     for name in ("box", "numbers", next(name for name in state if name.startswith("learned."))):
         with pytest.raises(KeyError, match=name.removeprefix("learned.")):
-            restore_field(tiny_options(kind), {k: x for k, x in state.items() if k != name}, 9)
+            restore_field(tiny_options(kind), {k: x for k, x in state.items() if k != name}, 9, 4)

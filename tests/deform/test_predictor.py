@@ -146,6 +146,7 @@ def test_masked_gaussians_do_not_reach_the_predictor() -> None:
 def test_gradients_stop_at_the_inputs_of_the_network() -> None:
     """The gradient of a mean is its factor, 0 if the Gaussian is not drawn; the camera has none."""
     field = trained_field()
+    field.parameters.values()["times"][0] = 5.0  # long after the clip
     gaussians = cloud()
     means = gaussians.means.clone().requires_grad_()
     eye = EYE.clone().requires_grad_()
@@ -161,7 +162,8 @@ def test_gradients_stop_at_the_inputs_of_the_network() -> None:
             torch.full((1, 1), 0.4),
         )
     drawn = found.opacities.detach()[:, None] > 0
-    assert 0 < int(drawn.sum()) < COUNT
+    assert not drawn[0]
+    assert drawn.any()
     torch.testing.assert_close(means.grad, torch.where(drawn, 1 + changes[:, :3], 0.0))
 
 
@@ -183,12 +185,14 @@ def test_weights_decay_towards_zero() -> None:
 def test_a_stored_predictor_gives_the_same_gaussians() -> None:
     field = trained_field()
     state = strip_roles(field_state(field))
-    restored = restore_field(OPTIONS, state, COUNT)
+    restored = restore_field(OPTIONS, state, COUNT, 4)
     assert isinstance(restored, Gaussians4D)
     for name, x in at(field, cloud()).tensors().items():
         assert torch.equal(at(restored, cloud()).tensors()[name], x)
     with pytest.raises(KeyError):
-        restore_field(OPTIONS, {n: x for n, x in state.items() if "joined_bias2" not in n}, COUNT)
+        restore_field(
+            OPTIONS, {n: x for n, x in state.items() if "joined_bias2" not in n}, COUNT, 4
+        )
 
 
 def test_a_stored_scene_keeps_each_number_of_the_rotations() -> None:

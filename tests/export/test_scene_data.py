@@ -99,7 +99,7 @@ def test_windows_in_time_and_lines_are_stored_as_they_are() -> None:
     assert curves.windows is scene.field.edges
     lists = PackedArrays()
     header = add_scene(scene_of_kind("gaussians_4d"), lists, 0.01)
-    assert header["lines"] == {"moving": 4, "least": 0.05, "waves": 2}
+    assert header["lines"] == {"moving": 4, "least": 0.05, "waves": 2, "exact": True}
     assert "curves" not in header
     assert read(lists, "lines").shape == (4, 5)
 

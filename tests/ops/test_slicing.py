@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dyngs.core.errors import DyngsError
 from dyngs.ops.quaternions import rotation_matrices
-from dyngs.ops.slicing import condition_gaussians, slice_gaussians
+from dyngs.ops.slicing import condition_gaussians, harmonics_in_time, slice_gaussians
 
 SHAPES = (3,), (), (4,), (4,), (3,), (), ()
 COUNT = 40
@@ -129,7 +129,7 @@ def test_a_slice_is_the_schur_complement(isa: str, dtype: torch.dtype) -> None:
 def test_extremes_are_exact(
     axes: tuple[float, ...], still: bool, span: float, dtype: torch.dtype, tolerance: float
 ) -> None:
-    """Lives of 1e-6 to 1e6 clips, at up to two standard deviations of time.
+    """Spans are 1e-6 to 1e6 clips; times are within two standard deviations.
 
     Two axes of a moving ball are equal, where gradients by scales are not exact.
     """
@@ -273,3 +273,22 @@ def test_no_gaussians_and_what_does_not_fit() -> None:
         short[place] = short[place][1:]
         with pytest.raises(DyngsError, match="slicing"):
             slice_gaussians(*short, time=0.0)
+
+
+@pytest.mark.parametrize("num_terms", [1, 16])
+def test_harmonics_over_time_are_a_cosine_series(num_terms: int) -> None:
+    """Of some of the Gaussians; those that are not seen keep the coefficients at their own time."""
+    rows = torch.tensor([5, 0, 3, 9])
+    seen = torch.tensor([True, True, False, True])
+    sh = normal(4, num_terms, 3).requires_grad_()
+    sh_time = normal(11, 3 * num_terms, 3, seed=1).requires_grad_()
+    elapsed = torch.tensor([0.1, -7.3, 0.2, 1e3 + 0.4]).double().requires_grad_()
+    found = harmonics_in_time(sh, sh_time, rows, elapsed, seen)
+    phases = 2 * math.pi * torch.arange(1, 4).double() * elapsed[:, None]
+    amplitudes = sh_time[rows].view(4, 3, num_terms, 3) * phases.cos()[:, :, None, None]
+    expected = sh + amplitudes.sum(1) * seen[:, None, None]
+    torch.testing.assert_close(found, expected)
+    by = normal(4, num_terms, 3, seed=2)
+    grads = [torch.autograd.grad(x, (sh, sh_time, elapsed), by) for x in (found, expected)]
+    for a, b in zip(*grads, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-9)

@@ -76,6 +76,11 @@ CASES = {
         "moving",
         (*DYNAMIC, "model.deform.kind=hexplane", "model.deform.resolution=16"),
     ),
+    "4D Gaussians": (
+        "dynamic",
+        "moving",
+        (*DYNAMIC, "model.deform.kind=gaussians_4d", "model.deform.predictor_width=8"),
+    ),
     "human": ("human", "person", ("train.steps=8", "model.resolution=24", "model.fit=false")),
     "ngp": ("ngp", "still", (*NGP, "train.steps=9")),
     "ngp in time": ("ngp", "moving", (*NGP, "train.steps=6", "model.time=true")),

@@ -14,7 +14,7 @@ from dyngs.core.errors import DyngsError, format_one_line
 from dyngs.data.times import evenly_spaced
 from dyngs.export.edit.frame import Point, parse_number, parse_point
 from dyngs.gaussians.scene import GaussianScene
-from dyngs.io.formats.similarity import Similarity
+from dyngs.io.formats.similarity import IDENTITY, Similarity
 
 _TIMES = 24  # Times at which moving Gaussians are tested
 
@@ -99,15 +99,26 @@ class ScreenPolygon:
 Region = Box | Sphere | ScreenPolygon
 
 
-def gaussians_in_region(region: Region, scene: GaussianScene, world: Similarity) -> Tensor:
-    """Return (N,) bool, Gaussians whose centre is in ``region`` at one training time or more.
+def gaussians_in_region(
+    region: Region,
+    scene: GaussianScene,
+    world: Similarity = IDENTITY,
+    times: Sequence[float | None] | None = None,
+) -> Tensor:
+    """Return (N,) bool, Gaussians whose centre is in ``region`` at one time or more at which they
+    exist.
 
     Args:
         world: transform from the scene to the coordinates of ``region``.
+        times: None: evenly chosen training times.
     """
-    times = scene.times if not scene.is_static else ()
-    sampled = [times[i] for i in evenly_spaced(len(times), _TIMES)] or [None]
+    scene = scene.without_masks()
+    if times is None:
+        own = () if scene.is_static else scene.times
+        times = [own[i] for i in evenly_spaced(len(own), _TIMES)] or [None]
     inside = np.zeros(len(scene), bool)
-    for time in sampled:
-        inside |= region.contains(world.points(scene.at(time).means.cpu().numpy()))
+    for time in times:
+        now = scene.at(time)
+        exists = (now.opacities > 0).cpu().numpy()
+        inside |= exists & region.contains(world.points(now.means.double().cpu().numpy()))
     return torch.from_numpy(inside)

@@ -157,6 +157,8 @@ def _notes(opened: OpenedScene, header: dict[str, Any]) -> tuple[str, ...]:
     person = as_human_scene(opened.renderable)
     if person is not None:
         notes += person.left_out
+    if not header.get("lines", {}).get("exact", True):
+        notes.append("4D Gaussians are shown as predicted at their mean times, without a camera")
     curves = header.get("curves", {})
     if curves.get("error"):
         error = opened.frame.scale * curves["error"]

@@ -228,6 +228,7 @@ def _add_lines(
     times = torch.stack([moving.times, moving.log_stds], dim=1)
     lists.exact("lines", _numpy(torch.cat([moving.velocities, times], dim=1)[order]))
     header = {"moving": len(order), "least": MIN_WEIGHT, "waves": field.num_waves}
+    header["exact"] = not field.depends_on_view
     if field.num_waves:
         lists.quantised("waves", _numpy(field.parameters["sh_time"][order].flatten(1)), 8)
     return header, now
