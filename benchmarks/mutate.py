@@ -75,6 +75,8 @@ MUTATIONS = (
     ("deform/schedule.py", "step % 2 == 0", "step % 2 == 1", "deform/test_time_window.py"),
     ("deform/static_errors.py", "TYPICAL_QUANTILE = 0.7", "TYPICAL_QUANTILE = 0.3", "deform/test_static_errors.py"),
     ("deform/static_errors.py", "gap = gap - gap.flatten(1)", "gap = gap - 0 * gap.flatten(1)", "deform/test_static_errors.py"),
+    ("deform/gaussians_4d.py", "[left.abs().argmax(1)]", "[left.argmax(1)]", "deform/test_gaussians_4d.py"),
+    ("export/edit/crop.py", "inside |= exists & region", "inside |= region", "deform/test_gaussians_4d.py"),
     ("deform/scene.py", "rows = torch.nonzero(descent >= 0)", "rows = torch.nonzero(descent > 0)", "deform/test_scene.py"),
     ("human/avatar/posing.py", "height == min(heights)", "height == max(heights)", "human/avatar/test_anchors.py"),
     ("ops/harmonics.py", "3 * z * z - 1", "3 * z * z", "ops/test_harmonics.py"),
