@@ -14,7 +14,6 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
-from torch.nn.functional import logsigmoid
 
 from dyngs.core.initialisation import glorot
 from dyngs.core.state import State, add_prefix, move_to_device, select_prefix
@@ -92,18 +91,6 @@ class OpacityWindow:
     # (M,) second derivative at a time, per squared clip, of the opacity over that of an open window
     curvature: Tensor
     log_spans: Tensor  # (M,) logarithms of the lifetimes, in clips
-
-
-def logit_curvature(logits: Tensor, window: Tensor) -> Tensor:
-    """Return the second derivative (M,) of sigmoid(L + w) / sigmoid(L), for ``OpacityWindow``.
-
-    ``logits`` (M,) are L; ``window`` (3, M) is w with its first and second derivative.
-    """
-    value, slope, bend = window
-    logits = logits.double()
-    opacity = (logits + value).sigmoid()
-    relative = (logsigmoid(logits + value) - logsigmoid(logits)).exp()
-    return relative * (1 - opacity) * (bend + (1 - 2 * opacity) * slope.square())
 
 
 class DeformationField:
@@ -259,9 +246,6 @@ class OuterField(DeformationField):
 
     def step(self, step: int, progress: float) -> Count:
         return self.parameters.step(step, progress) + self.inner_field.step(step, progress)
-
-    def opacity_window(self, gaussians: Gaussians, time: float) -> OpacityWindow | None:
-        return self.inner_field.opacity_window(gaussians, time)
 
     def penalties(self, time: float) -> dict[str, Tensor]:
         return self.inner_field.penalties(time)

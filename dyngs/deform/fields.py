@@ -17,9 +17,7 @@ from dyngs.deform.field import (
     DeformationField,
     FieldSetup,
     Offsets,
-    OpacityWindow,
     OuterField,
-    logit_curvature,
     select_rows,
 )
 from dyngs.deform.free import FreePrimitives
@@ -33,7 +31,7 @@ from dyngs.deform.keys import (
     MlpField,
 )
 from dyngs.deform.networks import Hexplane, Mlp
-from dyngs.gaussians import Gaussians, TopologyEdit
+from dyngs.gaussians import TopologyEdit
 from dyngs.gaussians.optimizer import Parameters
 from dyngs.ops.adam import Count
 
@@ -68,14 +66,6 @@ class WindowedField(OuterField):
         logits = window if offsets.logit_opacities is None else offsets.logit_opacities + window
         return replace(offsets, logit_opacities=logits)
 
-    def opacity_window(self, gaussians: Gaussians, time: float) -> OpacityWindow:
-        edges = self.edges.detach().double()
-        window = _window_derivatives(edges, time)
-        open_ = _window_derivatives(edges.new_tensor([OPEN_WINDOW]), time)
-        spans = (edges[:, 1] - edges[:, 0]).clamp_min(EDGE_WIDTH)
-        curvature = logit_curvature(gaussians.logit_opacities, window - open_)
-        return OpacityWindow(curvature, spans.log())
-
     def step(self, step: int, progress: float) -> Count:
         count = super().step(step, progress)
         self.edges.data[:, 0].clamp_min_(OPEN_WINDOW[0])
@@ -104,15 +94,6 @@ class WindowedField(OuterField):
 def _window(edges: Tensor, time: float) -> Tensor:
     inside = torch.stack([time - edges[:, 0], edges[:, 1] - time], dim=1) / EDGE_WIDTH
     return torch.nn.functional.logsigmoid(inside).sum(1)
-
-
-def _window_derivatives(edges: Tensor, time: float) -> Tensor:
-    """Return (3, M): the windows at ``time``, and their first and second derivative."""
-    outside = torch.stack([edges[:, 0] - time, time - edges[:, 1]], dim=1) / EDGE_WIDTH
-    hidden = outside.sigmoid()
-    slope = (hidden[:, 0] - hidden[:, 1]) / EDGE_WIDTH
-    bend = -(hidden * (1 - hidden)).sum(1) / EDGE_WIDTH**2
-    return torch.stack([_window(edges, time), slope, bend])
 
 
 def create_field(

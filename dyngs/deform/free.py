@@ -20,7 +20,6 @@ from dyngs.deform.field import (
     FieldSetup,
     Offsets,
     OpacityWindow,
-    logit_curvature,
     select_rows,
 )
 from dyngs.deform.fixed_cameras.initial_motion import TimedGaussians
@@ -77,8 +76,12 @@ class FreePrimitives(DeformationField):
     def opacity_window(self, gaussians: Gaussians, time: float) -> OpacityWindow:
         spans = self.parameters["log_spans"].detach()[:, 0].double().exp() + MIN_SPAN * self.gap
         elapsed = (time - self.parameters["centers"].detach()[:, 0].double()) / spans
-        window = torch.stack([-0.5 * elapsed.square(), -elapsed / spans, -spans.pow(-2)])
-        return OpacityWindow(logit_curvature(gaussians.logit_opacities, window), spans.log())
+        logits = gaussians.logit_opacities.double().clamp_min(-100)
+        opacity = (logits - 0.5 * elapsed.square()).sigmoid()
+        # The second derivative of the sigmoid of the logits, by the chain rule
+        bend = (1 - 2 * opacity) * elapsed.square() - 1
+        curvature = opacity * (1 - opacity) * bend / spans.square() / logits.sigmoid()
+        return OpacityWindow(curvature, spans.log())
 
     def apply_edit(self, edit: TopologyEdit) -> FreePrimitives:
         """Return the field after a topology edit; new rows are shifted in time, alternately back

@@ -185,8 +185,10 @@ class DynamicTraining(SceneTraining[DynamicScene]):
     def split_in_time(
         self, scene: DynamicScene, result: EditResult, generator: torch.Generator
     ) -> EditResult:
-        is_split = isinstance(scene.field, Gaussians4D) and "means" in result.changes
-        if not is_split or result.edit is None or scene.is_static:
+        field = scene.field
+        if not isinstance(field, Gaussians4D) or result.edit is None:
+            return result
+        if "means" not in result.changes or scene.is_static:
             return result
         position = torch.full((len(scene),), -1, device=scene.device)
         position[scene.moving] = torch.arange(len(scene.moving), device=scene.device)
@@ -196,12 +198,12 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         children = torch.nonzero(shrunk & (origin >= 0))[:, 0]
         source = result.edit.source[children]
         gaussians = scene.gaussians.detach().select(source)
-        means, changes = scene.field.split(gaussians, origin[children], generator)
+        means, changes = field.split(gaussians, origin[children], generator)
         moved = result.changes["means"].clone()
         moved[children] = means
-        fill = {}
+        fill: dict[str, Tensor] = {}
         for name, values in changes.items():
-            fill[name] = scene.field.parameters[name].detach()[origin.clamp_min(0)]
+            fill[name] = field.parameters[name].detach()[origin.clamp_min(0)]
             fill[name][children] = values
         return replace(result, changes=result.changes | {"means": moved}, motion_changes=fill)
 
@@ -223,8 +225,7 @@ class DynamicTraining(SceneTraining[DynamicScene]):
             scene.field.invalidate()
         scene.field.extend(self._window.bounds(step), self._window.bounds(step + 1))
         scene = self._add_windows(scene, step)
-        freezes = step in self.schedule.freeze_steps and scene.field.can_freeze
-        return self._freeze_static(scene) if freezes else scene
+        return self._freeze_static(scene) if step in self.schedule.freeze_steps else scene
 
     def edit_scene(self, scene: DynamicScene, step: int) -> tuple[DynamicScene, EditResult] | None:
         """Add the Gaussians that motion starts with; None if a static model explains all images."""
@@ -350,7 +351,7 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         """Freeze the Gaussians whose motion is too small to be visible."""
         field = scene.field
         now = scene.gaussians.detach()
-        if field is None:
+        if field is None or not field.can_freeze:
             return scene
         px_size = filter_std(now.means, self.capture.cameras)[scene.moving] / math.sqrt(
             FILTER_VARIANCE

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -366,11 +366,11 @@ class GaussianModel(Model[GaussianScene]):
         ``edited``: the scene after the edit, if it already exists.
         """
         self._optimizer.apply(result)
-        if edited is None:
-            edited = self._scene if result.edit is None else self._scene.apply_edit(result.edit)
-        if result.motion_changes:
-            edited = self.training.with_motion(edited, result.motion_changes)
-        self._scene = edited.with_gaussians(self._optimizer.parameters)
+        scene = edited
+        if scene is None:
+            unmoved = self._scene if result.edit is None else self._scene.apply_edit(result.edit)
+            scene = cast(GaussianScene, self.training.with_motion(unmoved, result.motion_changes))
+        self._scene = scene.with_gaussians(self._optimizer.parameters)
         if result.edit is not None:
             self.colours.apply_edit(result.edit)
             self.training.apply_edit(result.edit)
