@@ -154,7 +154,8 @@ class Gaussians4DField(Section):
 
     kind: Literal["gaussians_4d"] = Field(
         default="gaussians_4d",
-        description="each moving Gaussian has a covariance over space and time (4D Gaussians, Yang et al.)",
+        description="each moving Gaussian has a covariance over space and time (4D Gaussians, Yang "
+        "et al.)",
     )
     frequencies: int = Field(
         default=0,
@@ -176,8 +177,8 @@ class Gaussians4DField(Section):
     predictor_width: int = Field(
         default=0,
         ge=0,
-        description="neurons per layer of a network that deforms the moving Gaussians by view and time; 0: none; "
-        "MEGA: 256",
+        description="neurons per layer of a network that deforms the moving Gaussians by view and "
+        "time; 0: none; MEGA: 256",
     )
 
 

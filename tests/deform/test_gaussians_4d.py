@@ -1,4 +1,4 @@
-"""4D Gaussians: known shapes and lifetimes, splits and growth in time, storage, exports, PSNR."""
+"""4D Gaussians: known shapes and lifetimes, splits, growth, storage, exports and PSNR."""
 
 from __future__ import annotations
 
