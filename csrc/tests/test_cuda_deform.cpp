@@ -264,6 +264,7 @@ std::vector<std::vector<float>> slice_on_gpu(const SlicingCase& c, const SliceTi
                        {to(5), to(6), to(7), to(8), to(9), to(10), to(11)}, nullptr);
   cuda::condition(in, {to(12), to(13), to(14), to(15)}, nullptr);
   std::vector<std::vector<float>> values;
+  values.reserve(r.size());
   for (const auto& x : r) values.push_back(x->values());
   return values;
 }
