@@ -38,7 +38,7 @@ from dyngs.training.new_trainer import GaussianTrainer
 from dyngs.training.trainer import Trainer, TrainingEdit
 
 VOLUME_POWER = 0.1  # of 4DGS-1K and LightGaussian
-# At most so many training images are scored: all images at evenly chosen training times
+# Maximum number of scored training images; beyond it, those of evenly spaced times are used
 MOST_SCORED_IMAGES = 400
 
 
@@ -234,7 +234,7 @@ def scoring_views(
 
 
 def training_views(trainer: GaussianTrainer, scene: GaussianScene) -> ScoringViews:
-    """Return the training views; of many, all at evenly chosen times."""
+    """Return the training views; if there are too many, those of evenly spaced times."""
     views = scoring_views(trainer, scene, [])
     if scene.is_static:
         return views
