@@ -4,6 +4,7 @@
 // operations: bound by memory, 53 ps per row where neighbours in `rows` are neighbours in memory, else up to twice that.
 #include "cuda/api.hpp"
 #include "cuda/device.hpp"
+#include "cuda/rows.hpp"
 #include "math/quaternion.hpp"
 
 namespace dyngs::cuda {
@@ -36,16 +37,6 @@ __device__ void put3(const Array<float>& to, const Array<const float>& from) {
   for (int c = 0; c < 3; ++c) to[c] = static_cast<float>(from[c]);
 }
 
-__device__ Quat<float> quat_at(const float* rows, int64_t row) {
-  const Array<const float> q = global(rows) + 4 * row;
-  return {q[0], q[1], q[2], q[3]};
-}
-
-__device__ void put_quat(float* rows, int64_t row, const Quat<float>& q) {
-  const Array<float> to = global(rows) + 4 * row;
-  to[0] = q.w, to[1] = q.x, to[2] = q.y, to[3] = q.z;
-}
-
 __global__ void __launch_bounds__(kThreads)
     add_offsets_backward_kernel(RowOffsets<float> offsets, const float* quats, OffsetGrads<float> g) {
   const int64_t i = int64_t{blockIdx.x} * kThreads + threadIdx.x;
@@ -57,9 +48,9 @@ __global__ void __launch_bounds__(kThreads)
     global(g.by_logit_opacities)[i] = static_cast<float>(global(g.logit_opacities)[row]);
   if (g.by_colors != nullptr) put3(global(g.by_colors) + 3 * i, global(g.sh) + g.sh_stride * row);
   if (g.by_quats == nullptr) return;
-  const Quat<float> by = quat_at(g.quats, row), offset = quat_at(offsets.quats, i);
-  put_quat(g.by_quats, i, by * conjugate(quat_at(quats, row)));
-  put_quat(g.quats, row, conjugate(Quat<float>{offset.w + 1.f, offset.x, offset.y, offset.z}) * by);
+  const Quat<float> by = load4(g.quats, row), offset = load4(offsets.quats, i);
+  store4(g.by_quats, i, by * conjugate(load4(quats, row)));
+  store4(g.quats, row, conjugate(Quat<float>{offset.w + 1.f, offset.x, offset.y, offset.z}) * by);
 }
 
 }  // namespace

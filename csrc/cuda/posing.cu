@@ -7,6 +7,7 @@
 // the weights 48 + 4 J, the sums 48 + 4 J: 664 bytes, 0.2 ns; 48 J + 500 operations, 25 ps.
 #include "cuda/api.hpp"
 #include "cuda/reduce.hpp"
+#include "cuda/rows.hpp"
 #include "math/posing.hpp"
 
 namespace dyngs::cuda {
@@ -16,23 +17,6 @@ constexpr int kThreads = 128;
 constexpr int kSumThreads = 256;
 constexpr int kAffine = 12, kKept = 12;
 constexpr int64_t kShortestRun = 64, kMostRuns = 512;  // of Gaussians in one block's sums
-
-__device__ Vec3<float> load3(const float* rows, int64_t i) {
-  const Array<const float> from = global(rows) + 3 * i;
-  return {from[0], from[1], from[2]};
-}
-__device__ void store3(float* rows, int64_t i, const Vec3<float>& v) {
-  const Array<float> to = global(rows) + 3 * i;
-  to[0] = v.x, to[1] = v.y, to[2] = v.z;
-}
-__device__ Quat<float> load4(const float* rows, int64_t i) {
-  const Array<const float> q = global(rows) + 4 * i;
-  return {q[0], q[1], q[2], q[3]};
-}
-__device__ void store4(float* rows, int64_t i, const Quat<float>& q) {
-  const Array<float> to = global(rows) + 4 * i;
-  to[0] = q.w, to[1] = q.x, to[2] = q.y, to[3] = q.z;
-}
 
 __device__ RestShape<float> load_shape(const Posing<float>& in, int64_t i) {
   const Vec3<float> v = load3(in.log_scales, i);

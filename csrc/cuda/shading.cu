@@ -4,17 +4,13 @@
 // Neighbouring threads write rows of up to 14 numbers, which fill their sectors together.
 #include "cuda/api.hpp"
 #include "cuda/device.hpp"
+#include "cuda/rows.hpp"
 #include "math/shading.hpp"
 
 namespace dyngs::cuda {
 namespace {
 
 constexpr int kThreads = 256;
-
-__device__ Vec3<float> load3(const float* rows, int64_t i) {
-  const Array<const float> from = global(rows) + 3 * i;
-  return {from[0], from[1], from[2]};
-}
 
 // Writes numbers one after the other.
 struct Row {

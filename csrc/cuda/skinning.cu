@@ -8,6 +8,7 @@
 // point, 0.13 ns. A node followed by most of many points is one block's work.
 #include "cuda/api.hpp"
 #include "cuda/reduce.hpp"
+#include "cuda/rows.hpp"
 #include "cuda/sort.hpp"
 #include "math/skinning.hpp"
 
@@ -41,14 +42,6 @@ __global__ void __launch_bounds__(kThreads) node_table_kernel(SkinNodes<float> n
   global(table)[s] = row;
 }
 
-__device__ Vec3<float> load3(const float* rows, int64_t i) {
-  const Array<const float> from = global(rows) + 3 * i;
-  return {from[0], from[1], from[2]};
-}
-__device__ void store3(float* rows, int64_t i, const Vec3<float>& v) {
-  const Array<float> to = global(rows) + 3 * i;
-  to[0] = v.x, to[1] = v.y, to[2] = v.z;
-}
 __device__ Vec3<float> column(const Mat3<float>& m, int j) { return {m.m[0][j], m.m[1][j], m.m[2][j]}; }
 
 // Weights (the largest exponent is 0 before they are normalised) and the offset.
