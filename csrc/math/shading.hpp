@@ -1,4 +1,5 @@
-// Inputs of the network that gives compact colour (MEGA, Chen et al. 2024): place, direction and normal of a Gaussian.
+// Inputs of the network for compact colour (MEGA, Zhang et al. 2024):
+// position, direction and normal of a Gaussian.
 #pragma once
 
 #include "math/quaternion.hpp"
