@@ -39,6 +39,14 @@ def test_pauses_do_not_count() -> None:
     assert one.seconds(CONFIG, 100) == pytest.approx(other.seconds(CONFIG, 100))
 
 
+def test_one_time_computations_do_not_count() -> None:
+    one, other = (TimeForecast(0, 0.0, 0, PIXELS) for _ in range(2))
+    for step in range(1, 11):
+        one.observe(CONFIG, step, 1.0 * step, 0)
+        other.observe(CONFIG, step, 1.0 * step + (500.0 if step >= 6 else 0.0), 0)
+    assert one.seconds(CONFIG, 100) == pytest.approx(other.seconds(CONFIG, 100))
+
+
 def test_checkpoints_are_due_by_time_and_less_often_where_they_are_slow() -> None:
     timer = SaveTimer(1.0, 0.0)
     assert not timer.is_due(59)

@@ -1,7 +1,7 @@
 """``train.minutes``: number of steps that fit into a time limit.
 
-Steps are timed before training, and the number is corrected once after a quarter of the run.
-``dyngs.training.clock`` forecasts the cost of later steps.
+Steps are timed before training, and the number is corrected during the run, since the cost of
+motion and of images at full size is known late. ``dyngs.training.clock`` forecasts the cost of later steps.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ FEWEST = 200  # smallest number of steps; if fewer fit, the images are downscale
 SMALLEST_SIDE = 64  # longest side below which images are not downscaled, px
 AIM = 0.96  # planned fraction of the time limit
 WARM_UP = 2  # untimed steps before the timed steps
+CORRECTIONS = (0.25, 0.5, 0.75)  # fractions of the run at which the number of steps is corrected
 
 
 def fit_minutes(
@@ -112,7 +113,7 @@ def fitting_steps(
 
 
 class TimeLimit:
-    """Editor that corrects the number of steps once, and stops a run at the time limit.
+    """Editor that corrects the number of steps, and stops a run at the time limit.
 
     Args:
         most_steps: requested number of steps.
@@ -122,7 +123,7 @@ class TimeLimit:
     def __init__(self, seconds: float, most_steps: int, *, corrects: bool) -> None:
         self.seconds = seconds
         self.most_steps = most_steps
-        self._corrects = corrects
+        self._corrections = list(CORRECTIONS if corrects else ())
         self._forecast: TimeForecast | None = None
         self._waited = 0.0
 
@@ -144,9 +145,9 @@ class TimeLimit:
         self._forecast.observe(config, done, now, trainer.num_gaussians)
         if now + 2 * self._forecast.mean_step > self.seconds:
             return TrainingEdit(steps=done)
-        if not self._corrects or 4 * done < loop.total:
+        if not self._corrections or done < self._corrections[0] * loop.total:
             return None
-        self._corrects = False
+        del self._corrections[0]
         left = AIM * self.seconds - now - _decoding_seconds_left(trainer.images)
         found = fitting_steps(self._forecast, config, done, left, self.most_steps)
         is_small = abs(found - loop.total) <= 0.04 * loop.total

@@ -26,12 +26,14 @@ def config_of(root: Path, run: Path, minutes: float, *keys: str) -> Config:
     return load_config(packaged_preset("static"), [*fixed, *usual, *keys])
 
 
-def slow(monkeypatch: pytest.MonkeyPatch, seconds: float, after: int = 0) -> None:
-    """Delay every training step by ``seconds``, from step ``after`` on."""
+def slow(
+    monkeypatch: pytest.MonkeyPatch, seconds: float, after: int = 0, before: int = 10**9
+) -> None:
+    """Delay every training step by ``seconds``, from step ``after`` on up to ``before``."""
     real = Trainer.step
 
     def step(trainer: Trainer[Any]) -> Any:
-        if trainer.done >= after:
+        if after <= trainer.done < before:
             time.sleep(seconds)
         return real(trainer)
 
@@ -56,7 +58,7 @@ def test_what_fits_fits_and_one_more_does_not(still: Path, tmp_path: Path) -> No
 def test_a_run_ends_in_time_and_says_what_all_steps_would_cost(
     still: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its number of steps is measured, corrected once, and stored; a resumed run keeps it."""
+    """Its number of steps is measured, corrected, and stored; a resumed run keeps it."""
     slow(monkeypatch, 0.01)
     messages: list[str] = []
 
@@ -84,6 +86,16 @@ def test_a_run_that_gets_slow_ends_in_time(
     done = latest_checkpoint(run).info.step
     assert 30 <= done < 100
     assert load_resolved(run).train.steps == done
+
+
+def test_a_run_that_gets_fast_uses_its_time(
+    still: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slow(monkeypatch, 0.03, before=60)
+    run = train(config_of(still, tmp_path / "run", 0.1))
+    done = latest_checkpoint(run).info.step
+    assert load_resolved(run).train.steps == done
+    assert 0.6 * 60 * 0.1 < seconds_at(run, done) < 60 * 0.1 + 1
 
 
 def test_images_are_halved_until_enough_steps_fit(
