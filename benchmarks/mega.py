@@ -1,14 +1,15 @@
 """Sizes and PSNR of moving scenes with each part of MEGA (Zhang et al. 2024), at equal steps.
 
     python benchmarks/mega.py FOLDER --data CAPTURES [--jobs 2] [--steps 1500] [key=value ...]
-    python benchmarks/mega.py FOLDER --table
+    python benchmarks/mega.py FOLDER --table [--store]
 
 Each part is added to those before: the colour network, opacity entropy, and for 4D Gaussians the
 predictor of deformation. The last run of a system is then stored in half precision and zipped,
 as published, and as a .dyngs file. Both files are read again and evaluated on the test split.
 Megabytes of runs are float32 parameters. The published ratio of sizes is 125 (N3V) to 188
 (Technicolor). One row is stored as FOLDER/results/CAPTURE_SYSTEM_PART.json; stored rows are not
-measured again, and interrupted trainings are resumed. Overrides apply to all trainings.
+measured again, and interrupted trainings are resumed. Overrides apply to all trainings. `--store`
+keeps the rows for docs/results.md.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from typing import Any
 import numpy as np
 import torch
 from dynamic import write_result
-from results import current_commit, table
+from results import MEGA, current_commit, mega_table
 from torch import Tensor
 
 from dyngs.api.scene_file import write_scene_file
@@ -171,22 +172,14 @@ def run_part(row: Row, options: argparse.Namespace) -> None:
         measure(stored, stored.run, num_bytes, {})
 
 
-def results_table(folder: Path) -> str:
-    """Return the stored results in Markdown; ratios are to the first part of each system."""
+def load_rows(folder: Path) -> list[dict[str, Any]]:
+    """Return the stored results in the order of the parts."""
     paths = sorted((folder / "results").glob("*.json"))
     found = [json.loads(path.read_text(encoding="utf-8")) for path in paths]
     order = [*PARTS, *FILES]
-    found.sort(key=lambda x: (x["capture"], SYSTEMS.index(x["system"]), order.index(x["part"])))
-    first = {(x["capture"], x["system"]): x["mb"] for x in found if x["part"] == order[0]}
-    rows = [["capture", "system", "with", "MB", "ratio", "PSNR, dB", "what moves", "Gaussians"]]
-    for x in found:
-        start = first.get((x["capture"], x["system"]))
-        ratio = "" if start is None else f"{start / x['mb']:.1f}"
-        moving = "" if x["psnr_moving"] is None else f"{x['psnr_moving']:.2f}"
-        size = f"{x['mb']:.3f}"
-        numbers = [size, ratio, f"{x['psnr']:.2f}", moving, f"{x['gaussians']:,}"]
-        rows.append([x["capture"], x["system"], x["part"], *numbers])
-    return table(rows)
+    return sorted(
+        found, key=lambda x: (x["capture"], SYSTEMS.index(x["system"]), order.index(x["part"]))
+    )
 
 
 def main() -> None:
@@ -201,11 +194,12 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=1500)
     parser.add_argument("--jobs", type=int, default=1, help="runs at a time, one thread each")
     parser.add_argument("--table", action="store_true", help="print the table, do not train")
+    parser.add_argument("--store", action="store_true", help="keep the rows for docs/results.md")
     options = parser.parse_intermixed_args()
     options.folder = options.folder.absolute()
     options.data = options.data.absolute()
     if not options.table:
-        rows = [
+        wanted = [
             row
             for capture in options.captures
             for system in options.systems
@@ -213,8 +207,11 @@ def main() -> None:
             if (row := Row(options.folder, capture, system, part)).has(part)
         ]
         with ThreadPoolExecutor(options.jobs) as pool:
-            list(pool.map(lambda row: run_part(row, options), rows))
-    print(results_table(options.folder))
+            list(pool.map(lambda row: run_part(row, options), wanted))
+    rows = load_rows(options.folder)
+    print(mega_table(rows))
+    if options.store:
+        write_result(MEGA, rows)
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ and of the whole test split, speed relative to RUN, MB as float32 and as stored.
 FOLDER/SCORE_FRACTION_MASKS.json; stored rows are not trained again. `speeds` times all stored rows
 alternately at 400x400 on two threads and prints the table; run it when the machine has nothing
 else to do. Columns: PSNR of the whole test split, MB as float32 and as stored, frames a second.
+`--store CAPTURE` keeps that table for docs/results.md.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ from typing import Any
 
 import torch
 from dynamic import open_model, write_result
+from results import PRUNING, current_commit, pruning_table
 
 from dyngs.api.prune import export_folder, prune_run, prune_to_loss
 from dyngs.api.scene_file import write_scene_file
@@ -144,8 +146,8 @@ def quality(run_dir: Path) -> dict[str, Any]:
     return {"psnr": fmean(scores), "gaussians": len(scene), "mb": parameter_megabytes(scene)}
 
 
-def print_speeds(run_dir: Path, folder: Path) -> None:
-    """Time all stored rows alternately, and print the table."""
+def print_speeds(run_dir: Path, folder: Path, capture: str | None) -> None:
+    """Time all stored rows alternately, print the table, and store it under ``capture``."""
     rows = [json.loads(path.read_text(encoding="utf-8")) for path in folder.glob("*.json")]
     orders = list(SCORES), list(MASKS)
     rows.sort(
@@ -162,19 +164,14 @@ def print_speeds(run_dir: Path, folder: Path) -> None:
         views.append(replace(images[i], cameras=cameras))
     with kernel_threads(SPEED_THREADS):
         seconds = time_renders([model.renderer for model in models], views, rounds=3)
-    print("| score | removed | masks | test dB | MB | stored MB | frames/s |")
-    print("|---|---|---|---|---|---|---|")
+    timed = []
     for row, own in zip([trained, *rows], seconds, strict=True):
-        cells = [
-            row["score"],
-            f"{row['fraction']:.0%}",
-            row["masks"],
-            f"{row['psnr']:.2f}",
-            f"{row['mb']:.2f}",
-            f"{row['stored_mb']:.3f}" if "stored_mb" in row else "",
-            f"{1 / median(own.tolist()):.0f}",
-        ]
-        print(f"| {' | '.join(cells)} |")
+        facts = {"capture": capture, "commit": current_commit(), "fps": 1 / median(own.tolist())}
+        timed.append(row | facts)
+    print(pruning_table(timed))
+    if capture is not None:
+        before = json.loads(PRUNING.read_text(encoding="utf-8")) if PRUNING.is_file() else []
+        write_result(PRUNING, [row for row in before if row["capture"] != capture] + timed)
 
 
 def run_rows(given: argparse.Namespace) -> None:
@@ -272,6 +269,7 @@ def main() -> None:
     parser.add_argument("--fractions", nargs="+", type=float, default=[0.5, 0.7, 0.8, 0.85])
     parser.add_argument("--masks", nargs="+", choices=MASKS, default=["none", "published"])
     parser.add_argument("--jobs", type=int, default=1, help="rows at a time, one thread each")
+    parser.add_argument("--store", metavar="CAPTURE", help="with speeds: keep the table")
     parser.add_argument("--max-loss", type=float, nargs="+", default=[0.2])
     parser.add_argument("--threads", type=int, default=1)
     given = parser.parse_args()
@@ -282,7 +280,7 @@ def main() -> None:
         run_rows(given)
         return
     if given.rows == "speeds":
-        print_speeds(given.run_dir, given.folder)
+        print_speeds(given.run_dir, given.folder, given.store)
         return
     print(
         "| | Gaussians | train dB | test dB | times as fast | MB | stored |\n|---|---|---|---|---|---|---|"

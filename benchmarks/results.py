@@ -33,6 +33,8 @@ RESULTS = ROOT / "benchmarks/results"
 PAGES = ROOT / "docs/benchmarks"
 PUBLISHED = RESULTS / "published.yaml"
 MOVING = RESULTS / "comparisons/moving.json"  # rows of benchmarks/dynamic.py
+PRUNING = RESULTS / "comparisons/pruning.json"  # rows of benchmarks/prune.py
+MEGA = RESULTS / "comparisons/mega.json"  # rows of benchmarks/mega.py
 TABLE_BEGIN = "<!-- results: written by benchmarks/results.py -->"
 TABLE_END = "<!-- end of results -->"
 
@@ -408,6 +410,30 @@ def comparison_table(found: Sequence[Mapping[str, Any]]) -> str:
     )
 
 
+def pruning_table(found: Sequence[Mapping[str, Any]]) -> str:
+    """Return a Markdown table of rows of benchmarks/prune.py."""
+    rows = [["capture", "score", "removed", "masks", "PSNR, dB", "MB", "stored, MB", "frames/s"]]
+    for row in found:
+        stored = number(row.get("stored_mb"), 3)
+        removed = f"{row['fraction']:.0%}"
+        cells = [row["capture"] or "", row["score"], removed, row["masks"], number(row["psnr"])]
+        rows.append([*cells, number(row["mb"]), stored, number(row["fps"], 0)])
+    return table(rows)
+
+
+def mega_table(found: Sequence[Mapping[str, Any]]) -> str:
+    """Return a Markdown table of rows of benchmarks/mega.py; ratios are to the first part."""
+    first: dict[tuple[str, str], float] = {}
+    rows = [["capture", "system", "with", "MB", "ratio", "PSNR, dB", "what moves", "Gaussians"]]
+    for row in found:
+        start = first.setdefault((row["capture"], row["system"]), row["mb"])
+        size = [number(row["mb"], 3), number(start / row["mb"], 1)]
+        quality = [number(row["psnr"]), number(row["psnr_moving"])]
+        names = [row["capture"], row["system"], row["part"]]
+        rows.append([*names, *size, *quality, number(row["gaussians"], 0)])
+    return table(rows)
+
+
 SOURCES = {"code": "", "paper": "", "second": " (second hand)", "unverified": " (unverified)"}
 
 
@@ -419,6 +445,24 @@ class OwnFigure:
     protocol: str
     commit: str
     command: str
+
+
+def load_rows(path: Path) -> list[dict[str, Any]]:
+    """Return the stored rows of a comparison; none if there is no file."""
+    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
+
+
+def chosen_rows(system: Mapping[str, Any]) -> list[OwnFigure]:
+    """Return the figures of the rows that ``rows`` of a system selects: by file, key and value."""
+    found = []
+    for name, wanted in system.get("rows", {}).items():
+        for row in load_rows(RESULTS / f"comparisons/{name}.json"):
+            if all(row[key] == value for key, value in wanted.items()):
+                size = row.get("stored_mb", row["mb"])
+                figure = f"{row['capture']} {row['psnr']:.2f}, {size:.2f} MB"
+                protocol = f"[tables](#{name})"
+                found.append(OwnFigure(figure, protocol, row["commit"], system["command"]))
+    return found
 
 
 def own_figures(
@@ -441,7 +485,7 @@ def own_figures(
             figure = f"{capture} {spread_cell([row['psnr'] for row in seeds], '.2f')}"
             protocol = f"{seeds[0]['minutes']:g} minutes, one thread"
             found.append(OwnFigure(figure, protocol, seeds[0]["commit"], seeds[0]["command"]))
-    return found
+    return found + chosen_rows(system)
 
 
 def unmeasured_commands(system: Mapping[str, Any]) -> list[str]:
@@ -479,7 +523,7 @@ def systems_page(results: Mapping[str, Result], moving: Sequence[Mapping[str, An
             ]
         )
         commands.append(f"# {system['system']}")
-        commands += [x.command for x in own] or unmeasured_commands(system)
+        commands += dict.fromkeys(x.command for x in own) or unmeasured_commands(system)
     text = (
         "# Results beside published figures\n\n"
         "Every system that dyngs trains, with the figure of its paper and ours. The data sets of the\n"
@@ -493,6 +537,19 @@ def systems_page(results: Mapping[str, Result], moving: Sequence[Mapping[str, An
     )
     if moving:
         text += f"\n## Moving scenes at equal minutes\n\n{comparison_table(moving)}"
+    pruning = load_rows(PRUNING)
+    if pruning:
+        text += (
+            "\n## Pruning\n\n4D Gaussians pruned and fine-tuned. Scores and masks:\n"
+            "[motion](concepts/motion.md#pruning-over-time). Frames/s at 400x400 on two threads.\n\n"
+            f"{pruning_table(pruning)}\n"
+        )
+    parts = load_rows(MEGA)
+    if parts:
+        text += (
+            "\n## MEGA\n\nEach part is added to those before, at equal steps; the last run is stored as\n"
+            f"files. Parts: [motion](concepts/motion.md#compact-models-mega).\n\n{mega_table(parts)}\n"
+        )
     return text
 
 
@@ -500,8 +557,7 @@ def written_pages(results: dict[str, Result]) -> dict[Path, str]:
     """Return the contents of all pages, and of README.md with its new table."""
     pages = {PAGES / f"{page}.md": quality_page(page, results) for page in DETAILS}
     pages[PAGES / "size.md"] = size_page(results)
-    moving = json.loads(MOVING.read_text(encoding="utf-8")) if MOVING.is_file() else []
-    pages[ROOT / "docs/results.md"] = systems_page(results, moving)
+    pages[ROOT / "docs/results.md"] = systems_page(results, load_rows(MOVING))
     readme = ROOT / "README.md"
     before, rest = readme.read_text(encoding="utf-8").split(TABLE_BEGIN)
     after = rest.split(TABLE_END)[1]
