@@ -10,16 +10,17 @@ from dyngs.human.predict.keys import GpsModel
 from dyngs.human.synthetic.capture import PeopleOptions, write_people
 
 STEREO = GpsModel(person_px=32)
+RECURRENT = GpsModel(person_px=32, matching="recurrent", channels=24, updates=2)
 PEOPLE = PeopleOptions(people=2, size=40, cameras=24)
 
 
-def stereo_config(folder: Path, run: Path, **train: object) -> Config:
+def stereo_config(folder: Path, run: Path, model: GpsModel = STEREO, **train: object) -> Config:
     """Of four steps, two of depth alone, with a checkpoint after every second one; ``train``
     changes that."""
     return Config.model_validate(
         {
             "data": {"root": folder},
-            "model": STEREO.model_dump(),
+            "model": model.model_dump(),
             "train": {"steps": 4, "save_every": 2, "alpha_weight": 0.1} | train,
             "run": {"dir": run, "threads": 1},
         }

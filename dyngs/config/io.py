@@ -91,7 +91,7 @@ REMOVED_MODEL_KEYS: dict[str, dict[str, object]] = {
         "widths": [24, 32, 48, 64],
     },
     "nerf": {"width": 128, "coarse": 32, "fine": 32, "rays": 256},  # sizes=cpu
-    "gps": {"widths": [24, 40, 64], "depth_fraction": 0.4},
+    "gps": {"widths": [24, 40, 64]},
     "keypoint_nerf": {"features": 32, "width": 64, "patch": 32, "step": 0.015},
     "eg_human_nerf": {
         "features": 32,

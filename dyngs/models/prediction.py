@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, Generic, TypeVar
 
@@ -161,6 +161,7 @@ class Example:
     rendered: Tensor
     truth: Tensor
     num_gaussians: int = 0
+    scores: dict[str, float] = field(default_factory=dict)  # further ones, for the log
 
 
 class Learner(ABC, Generic[N]):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from statistics import fmean
@@ -36,6 +36,7 @@ class StepReport:
     rendered: Tensor
     truth: Tensor
     message: str | None = None  # lines to log, or None
+    scores: dict[str, float] = field(default_factory=dict)  # further ones of the model kind, logged
 
     @cached_property
     def psnr(self) -> float:

@@ -55,7 +55,14 @@ class NetworkTrainer:
         self.update(example.loss, step)
         self.done = step
         self.num_gaussians = example.num_gaussians
-        return StepReport(step, value, example.image, example.rendered, example.truth)
+        return StepReport(
+            step,
+            value,
+            example.image,
+            example.rendered,
+            example.truth,
+            scores=example.scores,
+        )
 
     def update(self, loss: Tensor, step: int) -> None:
         """Run a step of AdamW, skipped if gradients are not finite."""

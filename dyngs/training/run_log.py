@@ -62,7 +62,7 @@ class RunLog:
         """Log scores of ``StepDone`` and ``Evaluated``; write progress images to ``progress/``."""
         match event:
             case StepDone() if event.step % self._every == 0 or event.is_last:
-                self._append("train", asdict(log_record(event)))
+                self._append("train", asdict(log_record(event)) | event.report.scores)
             case Evaluated():
                 scores = asdict(event)
                 del scores["seconds"]

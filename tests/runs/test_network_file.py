@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from tiny_stereo import stereo_config
+from tiny_stereo import STEREO, stereo_config
 
 from dyngs.config import Config
 from dyngs.core.errors import DyngsError
@@ -26,7 +26,7 @@ def config(tmp_path: Path) -> Config:
 
 
 def checkpoint(scale: float = 1.0) -> Checkpoint:
-    network = GpsNetwork(torch.Generator().manual_seed(0))
+    network = GpsNetwork(torch.Generator().manual_seed(0), STEREO)
     tensors = {f"model.network.{name}": scale * x for name, x in network.state_dict().items()}
     return Checkpoint(
         INFO, tensors | {"rng": torch.zeros(3), "optimizer.step.x": torch.tensor(1.0)}
@@ -43,7 +43,7 @@ def test_weights_are_those_of_the_run_to_float16(config: Config, tmp_path: Path)
     assert weights.tensors.keys() == {name for name in stored.tensors if name.startswith("model.")}
     for name, x in weights.tensors.items():
         torch.testing.assert_close(x, stored.tensors[name], rtol=1e-3, atol=1e-7)
-    load_weights(GpsNetwork(torch.Generator()), weights)
+    load_weights(GpsNetwork(torch.Generator(), found.model), weights)
     assert str(tmp_path).encode() not in path.read_bytes()
     assert path.stat().st_size < 2.2 * sum(x.numel() for x in weights.tensors.values()) + 20_000
 

@@ -7,7 +7,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from dyngs.core.section import ModelSection, Positive, SceneModel
+from dyngs.core.section import Fraction, ModelSection, Positive, SceneModel
 
 
 class FieldPredictorModel(ModelSection):
@@ -72,6 +72,36 @@ class GpsModel(SceneModel):
         ge=32,
         le=4096,
         description="height of the person in the rectified views, px; one Gaussian per pixel",
+    )
+    matching: Literal["cost_volume", "recurrent"] = Field(
+        default="cost_volume",
+        description="how disparities are estimated; cost_volume: one correction of compared "
+        "colours and silhouettes; recurrent: repeated updates from correlated features, as in "
+        "GPS-Gaussian, slower",
+    )
+    updates: int = Field(
+        default=3,
+        ge=1,
+        le=64,
+        description="updates of each disparity, matching=recurrent only; more are slower",
+    )
+    channels: int = Field(
+        default=96,
+        ge=24,
+        le=768,
+        multiple_of=24,
+        description="channels of matching features and hidden state, a multiple of 24, "
+        "matching=recurrent only; fewer are faster",
+    )
+    consistency_weight: float = Field(
+        default=0.1,
+        ge=0,
+        description="weight of the disparity by which a surface of one view hides that of the "
+        "other view, matching=recurrent only",
+    )
+    depth_fraction: Fraction = Field(
+        default=0.4,
+        description="fraction of the training steps that train disparity only, before images",
     )
     lr: Positive = Field(
         default=1e-3, description="peak learning rate of AdamW (one-cycle schedule)"

@@ -190,12 +190,17 @@ class RectifiedPair:
     def alpha_in_other_view(self, offsets: Tensor) -> Tensor:
         """Return the alpha (2, 1, H, W) of the other crop at the match of each pixel;
         differentiable."""
+        return self.in_other_view(self.alpha, offsets)
+
+    def in_other_view(self, layers: Tensor, offsets: Tensor) -> Tensor:
+        """Return ``layers`` (2, D, H, W) of the other crop at the match of each pixel, bilinear; 0
+        outside."""
         height, width = offsets.shape[2:]
         sides = offsets.new_tensor([1.0, -1.0])[:, None, None]
         column = torch.arange(width, device=offsets.device) + 0.5 - sides * offsets[:, 0]
         row = (torch.arange(height, device=offsets.device) + 0.5)[:, None].expand_as(column)
         grid = torch.stack([2 * column / width - 1, 2 * row / height - 1], dim=-1)
-        return grid_sample(self.alpha.flip(0), grid, align_corners=False)
+        return grid_sample(layers.flip(0), grid, align_corners=False)
 
     def points(self, depth: Tensor) -> Tensor:
         """Return world points (2, H, W, 3) of all pixels at ``depth`` (2, 1, H, W)."""

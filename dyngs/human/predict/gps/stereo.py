@@ -1,12 +1,8 @@
-"""Learned stereo: disparity of every pixel of a rectified pair, and Gaussians of the pixels.
+"""Learned stereo: Gaussians of the pixels of a rectified pair, training and prediction.
 
-GPS-Gaussian (Zheng et al. 2024) refines matches of learned features iteratively. Here the costs of
-candidate offsets are computed: colour differences (plane sweep, Collins 1996) and whether the
-other view shows the background (visual hull). The network corrects them; untrained it equals block
-matching.
+After GPS-Gaussian (Zheng et al. 2024), with the disparities of ``matching``.
 
-Symbols: two views, left and right; crops of H x W pixels, h x w a quarter of it; C channels, D
-offsets.
+Symbols: two views, left and right; crops of H x W pixels, h x w a quarter of it.
 """
 
 from __future__ import annotations
@@ -18,13 +14,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import (
-    avg_pool2d,
-    interpolate,
-    max_pool2d,
-    pad,
     pixel_shuffle,
     pixel_unshuffle,
-    unfold,
 )
 
 from dyngs.config import Config, DataConfig
@@ -41,6 +32,7 @@ from dyngs.gaussians.filters import FilterUpdate
 from dyngs.gaussians.scene import render_options
 from dyngs.gaussians.static_scene import StaticScene, ViewSides
 from dyngs.gaussians.static_training import StaticTraining
+from dyngs.human.predict.gps.matching import CostVolumeNetwork, RecurrentNetwork
 from dyngs.human.predict.gps.rectification import (
     MAX_ANGLE,
     RectifiedPair,
@@ -70,130 +62,6 @@ from dyngs.models.renderable import Renderable
 from dyngs.ops.device import CPU, select_device
 from dyngs.ops.quaternions import quat_product, quats_from_matrices, unit_quats
 
-QUARTER = 4
-"""Pixels of the crops per pixel of the plane sweep, per axis."""
-NUM_OFFSETS = 48
-"""Candidate offsets, evenly spaced in ``RANGE``."""
-RANGE = (-0.22, 0.28)
-"""Range of offsets, relative to the disparity of the person's middle: 0.56 m behind to 0.44 m in
-front of it at a distance of 2 m."""
-_COLOUR, _BESIDE = 300.0, 5.0  # factors of colour difference and background in the offset logits
-_SHARPNESS = 2.0  # of upsampling weights, which fall with the squared distance
-_NEVER = -1e4  # logit of excluded values
-SIDES = (1.0, -1.0)
-"""Direction of a match's motion with its offset: left in the right view, right in the left."""
-
-
-class StereoNetwork(nn.Module):
-    """U-Net that predicts the offsets of two views from plane-sweep costs and image features."""
-
-    def __init__(self, widths: Sequence[int]) -> None:
-        super().__init__()
-        fine, middle, coarse = widths
-        self.enter = _block(2 * NUM_OFFSETS + fine, fine)
-        self.down = nn.ModuleList(
-            [_block(fine + middle, middle, 2), _block(middle + coarse, coarse, 2)]
-        )
-        self.deep = ResidualBlock(coarse)
-        self.up = nn.ModuleList([_block(coarse + middle, middle), _block(middle + fine, fine)])
-        self.change = nn.Conv2d(fine, NUM_OFFSETS + 1, 3, padding=1)
-        self.weights = nn.Conv2d(fine, 9 * QUARTER**2, 3, padding=1)
-
-    def forward(
-        self, levels: Sequence[Tensor], swept: Tensor, offsets: Sequence[int], inside: Tensor
-    ) -> tuple[list[Tensor], Tensor]:
-        """Return offsets (2, 1, H, W), px, bilinearly upsampled and refined, and features (2, C, h
-        / 2, w / 2).
-
-        Args:
-            levels: image features at 1/4, 1/8 and 1/16 of the resolution.
-            swept: costs of ``plane_sweep_costs``.
-            offsets: D candidate offsets.
-            inside: (2, 1, H, W), 1 on the person.
-        """
-        fine = self.enter(torch.cat([levels[0], 5 * swept], dim=1))
-        middle = self.down[0](torch.cat([fine, upsample(levels[1])], dim=1))
-        coarse = self.deep(self.down[1](torch.cat([middle, upsample(levels[2])], dim=1)))
-        middle = self.up[0](torch.cat([middle, upsample(coarse)], dim=1))
-        fine = self.up[1](torch.cat([fine, upsample(middle)], dim=1))
-        change = self.change(fine)
-        colours, beside = swept.split(NUM_OFFSETS, dim=1)
-        probabilities = (change[:, 1:] - _COLOUR * colours - _BESIDE * beside).softmax(dim=1)
-        expected = (probabilities * probabilities.new_tensor(offsets)[:, None, None]).sum(
-            1, keepdim=True
-        ) + change[:, :1]
-        upsampled_offsets = interpolate(expected, scale_factor=QUARTER, mode="bilinear")
-        return [
-            upsampled_offsets,
-            convex_upsample(expected, self.weights(fine), max_pool2d(inside, QUARTER)),
-        ], middle
-
-
-def _block(before: int, width: int, stride: int = 1) -> nn.Module:
-    return nn.Sequential(nn.Conv2d(before, width, 3, stride, padding=1), ResidualBlock(width))
-
-
-def candidate_offsets(shift: Tensor) -> list[int]:
-    """Return D candidate offsets, even px, for the disparity ``shift`` of the person's middle."""
-    return [
-        2 * round(float(x))
-        for x in (shift / 2) * torch.linspace(*RANGE, NUM_OFFSETS, device=shift.device)
-    ]
-
-
-def plane_sweep_costs(rgb: Tensor, alpha: Tensor, offsets: Sequence[int]) -> Tensor:
-    """Return costs (2, 2 D, h, w): per offset the colour difference, and the background of the
-    other view.
-
-    Computed at half the resolution of ``rgb`` (2, 3, H, W) and ``alpha`` (2, 1, H, W), and
-    averaged over 3 x 3 and 2 x 2 pixels.
-    """
-    layers = avg_pool2d(torch.cat([rgb * alpha, alpha], dim=1), 2)
-    width = layers.shape[3]
-    padding = min(max(abs(x) // 2 for x in offsets), width)
-    padded = pad(layers.flip(0), (padding, padding))
-    colours = []
-    beside = []
-    for offset in offsets:
-        starts = (padding - int(side) * max(-padding, min(padding, offset // 2)) for side in SIDES)
-        other = torch.stack(
-            [view[..., at : at + width] for view, at in zip(padded, starts, strict=True)]
-        )
-        colours.append((other[:, :3] - layers[:, :3]).abs().mean(1))
-        beside.append(1 - other[:, 3])
-    volume = torch.stack([*colours, *beside], dim=1)
-    return avg_pool2d(avg_pool2d(volume, 3, 1, 1, count_include_pad=False), 2)
-
-
-def convex_upsample(coarse: Tensor, weights: Tensor, inside: Tensor) -> Tensor:
-    """Upsample ``coarse`` (B, 1, h, w) to (B, 1, 4 h, 4 w) by convex combination (Teed and Deng
-    2020).
-
-    ``weights`` (B, 9 * 16, h, w) are logits of the 3 x 3 neighbours for each of the 16 pixels,
-    added to those of a Gaussian. Neighbours where ``inside`` (B, 1, h, w) is 0 are excluded.
-    """
-    batch, _, height, width = coarse.shape
-    values, known = (
-        unfold(pad(x, (1, 1, 1, 1), mode=mode), 3).view(batch, 9, 1, 1, height, width)
-        for x, mode in ((coarse, "replicate"), (inside, "constant"))
-    )
-    logits = weights.view(batch, 9, QUARTER, QUARTER, height, width) + _gaussian_logits(coarse)
-    shares = torch.where(known > 0, logits, _NEVER).softmax(dim=1)
-    fine = (shares * values).sum(1)
-    return fine.permute(0, 3, 1, 4, 2).reshape(batch, 1, QUARTER * height, QUARTER * width)
-
-
-def _gaussian_logits(like: Tensor) -> Tensor:
-    """Return Gaussian logits (9, 4, 4, 1, 1) of 3 x 3 neighbours for each of 4 x 4 pixels."""
-    pixel = (torch.arange(QUARTER, dtype=like.dtype, device=like.device) + 0.5) / QUARTER - 0.5
-    square = (
-        torch.arange(-1.0, 2.0, dtype=like.dtype, device=like.device)[:, None] - pixel
-    ).square()
-    return -_SHARPNESS * (square[:, None, :, None] + square[None, :, None, :]).reshape(
-        9, QUARTER, QUARTER, 1, 1
-    )
-
-
 WIDTHS = (24, 40, 64)
 """Channels of image features at 1/4, 1/8 and 1/16 of the resolution."""
 HEADS = {"rotation": 4, "scale": 3, "opacity": 1}
@@ -215,13 +83,17 @@ class GpsNetwork(nn.Module):
     It works at half the resolution of the crops, with pixels (un)shuffled in blocks of four.
     """
 
-    def __init__(self, generator: torch.Generator) -> None:
-        """Create the network on the CPU with weights from ``generator``."""
+    def __init__(self, generator: torch.Generator, section: Any) -> None:
+        """Create the network of a ``GpsModel`` on the CPU with weights from ``generator``."""
         super().__init__()
         half, quarter, _ = WIDTHS
         with torch.device("cpu"):
             self.encoder = Encoder(16, WIDTHS)
-            self.stereo = StereoNetwork(WIDTHS)
+            self.stereo = (
+                RecurrentNetwork(WIDTHS, section.channels, section.updates)
+                if section.matching == "recurrent"
+                else CostVolumeNetwork(WIDTHS)
+            )
             self.depth_encoder = Encoder(8, _DEPTH_WIDTHS)
             below = quarter + _DEPTH_WIDTHS[1] + _DEPTH_WIDTHS[2]
             self.up = nn.ModuleList(
@@ -245,10 +117,7 @@ class GpsNetwork(nn.Module):
         inside = pair.solid.float()
         images = pixel_unshuffle(torch.cat([(2 * pair.rgb - 1) * inside, pair.alpha], dim=1), 2)
         levels = self.encoder(images)
-        candidates = candidate_offsets(pair.shift)
-        offsets, fused = self.stereo(
-            levels, plane_sweep_costs(pair.rgb, pair.alpha, candidates), candidates, inside
-        )
+        offsets, fused = self.stereo(pair, levels)
         if not with_gaussians:
             return offsets, None
         depth = pixel_unshuffle(torch.cat([offsets[-1] / _RANGE * inside, inside], dim=1), 2)
@@ -294,22 +163,39 @@ def surface_gaussians_of_pair(pair: RectifiedPair, offsets: Tensor, raw: Tensor)
     )
 
 
+def end_point_error(pair: RectifiedPair, offsets: Tensor) -> Tensor:
+    """Return the mean error of ``offsets`` (2, 1, H, W) where the truth is known, px."""
+    known = pair.solid & pair.offsets.isfinite()
+    return (offsets[known] - pair.offsets[known]).abs().mean()
+
+
 def offset_loss(pair: RectifiedPair, offsets: Sequence[Tensor], decay: float) -> Tensor:
-    """Return the weighted sum of mean offset errors, px, where the truth is known.
+    """Return the weighted sum of the end-point errors of all ``offsets``, px.
 
     The last offsets have weight 1, each earlier one ``decay`` times the next (Teed and Deng 2020).
     """
-    known = pair.solid & pair.offsets.isfinite()
-    truth = pair.offsets[known]
     total = torch.zeros((), device=pair.rgb.device)
     for i, found in enumerate(reversed(offsets)):
-        total = total + decay**i * (found[known] - truth).abs().mean()
+        total = total + decay**i * end_point_error(pair, found)
     return total
 
 
-DEPTH_FRACTION = 0.4  # of the training steps, which train depth only
+def consistency_loss(pair: RectifiedPair, offsets: Tensor) -> Tensor:
+    """Return by how much pixels lie in front of the surface that the other view sees there, px.
+
+    The mean over all pixels of the person whose match lies inside the other silhouette. A pixel
+    behind that surface may be hidden from the other view and does not count.
+    """
+    matches = offsets.detach()
+    other = pair.in_other_view(offsets, matches)
+    known = pair.solid & (pair.in_other_view(pair.solid.float(), matches) > _INSIDE)
+    return ((offsets - other).relu() * known).sum() / known.sum().clamp_min(1)
+
+
 DECAY = 0.9
 """Weight of an iteration's offset error relative to the next."""
+_DECAY_POWER = 15  # weight of the first of all updates: DECAY to this power (Lipson et al. 2021)
+_INSIDE = 0.999  # share of the person at a match without background, up to rounding
 DEPTH_WEIGHT = 0.02  # of the offset error, px, next to the image loss
 _AROUND = 8  # background around the person in target images, px
 _MIN_OPACITY = 0.02  # of predicted Gaussians
@@ -395,12 +281,14 @@ class GpsLearner(Learner[GpsNetwork]):
         left, right = (images[i] for i in pair)
         rectified = rectify_views(left, right, self.section.person_px)
         rectified = move_fields_to(rectified, self.device)
-        only_depth = step <= round(DEPTH_FRACTION * self.config.train.steps)
+        only_depth = step <= round(self.section.depth_fraction * self.config.train.steps)
         offsets, raw = self.network(rectified, with_gaussians=not only_depth)
-        depth_loss = offset_loss(rectified, offsets, DECAY)
+        depth_loss = self._depth_loss(rectified, offsets)
+        scores = {"end_point_error_px": float(end_point_error(rectified, offsets[-1].detach()))}
         if only_depth:
             predicted = _offset_image(rectified, offsets[-1].detach())
-            return Example(depth_loss, left, predicted, _offset_image(rectified, rectified.offsets))
+            truth = _offset_image(rectified, rectified.offsets)
+            return Example(depth_loss, left, predicted, truth, scores=scores)
         gaussians = surface_gaussians_of_pair(rectified, offsets[-1], raw)
         image = crop_to_person(images[target], _AROUND).to(self.device)
         options = replace(render_options(self.config.model), nonfinite="trust")
@@ -410,7 +298,15 @@ class GpsLearner(Learner[GpsNetwork]):
         truth = image.composite(background)
         loss = image_loss(render.rgb[0], render.alpha[0], image, truth, self.config.train)
         loss = loss + DEPTH_WEIGHT * depth_loss
-        return Example(loss, image, render.rgb[0].detach(), truth, len(gaussians))
+        return Example(loss, image, render.rgb[0].detach(), truth, len(gaussians), scores)
+
+    def _depth_loss(self, pair: RectifiedPair, offsets: Sequence[Tensor]) -> Tensor:
+        """Return the loss of all ``offsets``, px."""
+        if self.section.matching == "cost_volume":
+            return offset_loss(pair, offsets, DECAY)
+        decay = DECAY ** (_DECAY_POWER / max(len(offsets) - 1, 1))
+        consistency = self.section.consistency_weight * consistency_loss(pair, offsets[-1])
+        return offset_loss(pair, offsets, decay) + consistency
 
 
 def _open_person(data: DataConfig) -> tuple[ImageLoader, list[tuple[tuple[int, int], list[int]]]]:
@@ -448,7 +344,8 @@ def _offset_image(pair: RectifiedPair, offsets: Tensor) -> Tensor:
 def learner(config: Config, generator: torch.Generator) -> GpsLearner:
     """Return the network in training, before the first step."""
     device = select_device(config.run.device)
-    return GpsLearner(config, GpsNetwork(generator).to(device), list_captures(config.data), device)
+    network = GpsNetwork(generator, config.model).to(device)
+    return GpsLearner(config, network, list_captures(config.data), device)
 
 
 def predictor(
@@ -459,6 +356,6 @@ def predictor(
     on_progress: ProgressCallback,
 ) -> Predictor[Any]:
     """Return the network of ``checkpoint`` with the capture of ``data``."""
-    network = GpsNetwork(torch.Generator())
+    network = GpsNetwork(torch.Generator(), config.model)
     load_weights(network, checkpoint)
     return GpsPredictor(config, network, _with_silhouettes(data), data)

@@ -13,11 +13,12 @@ import pytest
 import torch
 from camera_rings import UP, cameras_at
 from stopped import stopped
-from tiny_stereo import stereo_config, stereo_people
+from tiny_stereo import RECURRENT, stereo_config, stereo_people
 
 from dyngs.api.predict import predict
 from dyngs.api.train import train
 from dyngs.config import DataConfig
+from dyngs.config.io import load_resolved
 from dyngs.core.conventions import ignore_progress
 from dyngs.core.errors import DyngsError
 from dyngs.core.metrics import psnr
@@ -26,11 +27,14 @@ from dyngs.data.loader import ImageLoader
 from dyngs.data.read import list_captures, read_capture
 from dyngs.evaluate.report import evaluate_run
 from dyngs.gaussians.static_scene import StaticScene
+from dyngs.human.predict.gps.matching import RecurrentNetwork
 from dyngs.human.predict.gps.rectification import neighbour_pairs
-from dyngs.human.predict.gps.stereo import learner, predictor
+from dyngs.human.predict.gps.stereo import GpsNetwork, learner, predictor
+from dyngs.human.predict.keys import GpsModel
 from dyngs.human.synthetic.capture import PeopleOptions, write_people
-from dyngs.models.prediction import Predictor
+from dyngs.models.prediction import Predictor, load_weights
 from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint, load_run
+from dyngs.runs.network_file import read_network, write_network
 from dyngs.training.prediction import network_trainer
 
 
@@ -61,6 +65,48 @@ def test_a_resumed_run_ends_with_the_same_bytes(folder: Path, run: Path, tmp_pat
     assert not torch.equal(
         before.tensors["model.network.heads.bias"], after.tensors["model.network.heads.bias"]
     )
+
+
+def test_recurrent_matching_is_trained_resumed_stored_and_used(
+    folder: Path, tmp_path: Path
+) -> None:
+    """Errors are logged in both stages; resumed within either the end has the same bytes; a file
+    of weights predicts what its run does, with the updates of the run."""
+    whole = train(stereo_config(folder, tmp_path / "whole", RECURRENT, save_every=1, log_every=1))
+    lines = [json.loads(line) for line in (whole / "log.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines] == [1, 2, 3, 4]
+    assert all(0 < line["end_point_error_px"] < 100 for line in lines)
+    last = checkpoint_paths(whole)[-1]
+    for step in (1, 3):
+        config = stereo_config(folder, tmp_path / f"parts{step}", RECURRENT, save_every=1)
+        resumed = train(config, resume_from=stopped(config, step))
+        assert checkpoint_paths(resumed)[-1].read_bytes() == last.read_bytes()
+    file = write_network(
+        whole, load_resolved(whole), load_checkpoint(last), tmp_path / "net.safetensors"
+    )
+    person = read_captured_person(folder)
+    names = ("f000_c03.png", "f000_c05.png")
+    scenes = []
+    for network in (whole, file):
+        made = predict(network, person, tmp_path / f"{network.stem}_scene", names)
+        scenes.append(load_run(made.run_dir).scene)
+    torch.testing.assert_close(
+        scenes[0].gaussians.means, scenes[1].gaussians.means, atol=1e-3, rtol=0
+    )
+    config, checkpoint = read_network(file)
+    assert isinstance(config.model, GpsModel)
+    assert config.model == RECURRENT
+    network = GpsNetwork(torch.Generator(), config.model)
+    load_weights(network, checkpoint)
+    assert isinstance(network.stereo, RecurrentNetwork)
+    assert network.stereo.updates == 2
+
+
+def test_weights_of_the_other_matching_are_refused(run: Path) -> None:
+    with pytest.raises(DyngsError, match="is not of this network; was its config changed"):
+        load_weights(
+            GpsNetwork(torch.Generator(), RECURRENT), load_checkpoint(checkpoint_paths(run)[-1])
+        )
 
 
 def test_training_lowers_the_errors(folder: Path, tmp_path: Path) -> None:

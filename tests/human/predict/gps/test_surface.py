@@ -8,7 +8,14 @@ import torch
 from ray_traced_ball import CENTER, RADIUS, ball, exact_depth, pose_at
 
 from dyngs.human.predict.gps.rectification import RectifiedPair, rectify_views
-from dyngs.human.predict.gps.stereo import GpsNetwork, offset_loss, surface_gaussians_of_pair
+from dyngs.human.predict.gps.stereo import (
+    GpsNetwork,
+    consistency_loss,
+    end_point_error,
+    offset_loss,
+    surface_gaussians_of_pair,
+)
+from dyngs.human.predict.keys import GpsModel
 
 
 @pytest.fixture(scope="module")
@@ -49,9 +56,35 @@ def test_surfaces_unseen_by_the_other_view_are_transparent(pair: RectifiedPair) 
     assert wrong[beside].max() < 1e-3
 
 
-def test_gradients_reach_every_weight(pair: RectifiedPair) -> None:
+def test_end_point_errors_are_of_known_pixels_and_weighted_by_update(pair: RectifiedPair) -> None:
+    truth = torch.where(pair.solid, pair.offsets, 1e3)
+    assert float(end_point_error(pair, truth)) == 0
+    assert float(end_point_error(pair, truth - 2.0)) == pytest.approx(2.0, rel=1e-5)
+    found = [truth + 4.0, truth - 2.0, truth + 1.0]
+    expected = 1.0 + 0.5 * 2.0 + 0.25 * 4.0
+    assert float(offset_loss(pair, found, 0.5)) == pytest.approx(expected, rel=1e-5)
+
+
+def test_only_surfaces_in_front_of_the_other_view_are_inconsistent(pair: RectifiedPair) -> None:
+    """The true surface is consistent. In one view nearer, it hides that of the other view by as
+    much; in one view farther, it is the other one that hides it."""
+    truth = pair.focal * pair.baseline / exact_depth(pair) - pair.shift
+    truth = torch.where(pair.solid, truth, 0.0)
+    assert float(consistency_loss(pair, truth)) < 0.1
+    ends = (truth + 3.0 * torch.tensor([1.0, 0.0])[:, None, None, None]).requires_grad_()
+    loss = consistency_loss(pair, ends)
+    assert float(loss.detach()) == pytest.approx(1.5, abs=0.15), "half of the pixels, by 3 px"
+    loss.backward()
+    assert ends.grad is not None
+    assert ends.grad[0].sum() > 0.4
+    assert ends.grad[1].sum() < -0.4, "either of the two may be wrong"
+
+
+@pytest.mark.parametrize("matching", ["cost_volume", "recurrent"])
+def test_gradients_reach_every_weight(pair: RectifiedPair, matching: str) -> None:
     """Depth errors reach the weights of the depth, and Gaussian parameters reach all weights."""
-    network = GpsNetwork(torch.Generator().manual_seed(0))
+    section = GpsModel.model_validate({"matching": matching, "channels": 24})
+    network = GpsNetwork(torch.Generator().manual_seed(0), section)
     torch.nn.init.normal_(network.heads.weight, generator=torch.Generator().manual_seed(1))
     torch.nn.init.normal_(
         network.stereo.change.weight, std=0.1, generator=torch.Generator().manual_seed(2)
