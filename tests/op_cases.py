@@ -26,8 +26,8 @@ from dyngs.ops.patches import (
 from dyngs.ops.perceptron import Layer, perceptron
 from dyngs.ops.planes import PlaneLevel, hexplane_features, plane_penalty
 from dyngs.ops.posing import pose_by_joints
-from dyngs.ops.projection import project
-from dyngs.ops.rasterization import Tally, tally
+from dyngs.ops.projection import Projection, project
+from dyngs.ops.rasterization import BlendOptions, Boundaries, Tally, rasterize, tally
 from dyngs.ops.rays import MarchSteps, Rays, Space, composite, march, reached
 from dyngs.ops.registration import count_nonfinite_op
 from dyngs.ops.shading import shading_inputs
@@ -304,6 +304,33 @@ def patches_case(count: int, dtype: torch.dtype) -> Case:
     return Case(run, (colours, points), num_signals=1)
 
 
+def boundaries_case(count: int, dtype: torch.dtype) -> Case:
+    """Gaussians of three patches, weighted by the distance to samples of their outlines."""
+    numbers = Numbers(dtype)
+    width, height = 21, 18
+    shown = numbers.below(4, height, width).int() - 1
+    owners = numbers.below(3, count).int()
+    ids = numbers.below(3, 2 * count).int()
+    depths = 1 + numbers.uniform(1, count)
+    radii = torch.full((1, count, 2), 99, dtype=torch.int32)
+    extent = torch.tensor([width, height], dtype=dtype)
+    tilt = torch.tensor([0.4, 0.1, 0.5], dtype=dtype)
+    inputs = [numbers.uniform(1, count, 2) * extent, tilt + 0.1 * numbers.uniform(1, count, 3)]
+    inputs += [0.2 + 0.6 * numbers.uniform(1, count), numbers.uniform(1, count, 3)]
+    inputs += [numbers.uniform(2 * count, 2) * extent]
+    options = BlendOptions(alpha_min=0, transmittance_min=0)
+
+    def run(*x: Tensor) -> list[Tensor]:
+        projection = Projection(x[0], depths, x[1], torch.ones_like(depths), radii)
+        bounds = Boundaries(shown, owners, x[4], ids, 2.5)
+        found = rasterize(
+            projection, x[2], x[3], (width, height), options=options, boundaries=bounds
+        )
+        return [found.color, found.transmittance]
+
+    return Case(run, tuple(map(leaf, inputs)))
+
+
 CASES: dict[str, Callable[[int, torch.dtype], Case]] = {
     "render": render_case,
     "tally": tally_case,
@@ -319,4 +346,6 @@ CASES: dict[str, Callable[[int, torch.dtype], Case]] = {
     "perceptron": perceptron_case,
     "field": field_case,
     "patches": patches_case,
+    "boundaries": boundaries_case,
 }
+ON_GPU = [name for name in CASES if name != "boundaries"]

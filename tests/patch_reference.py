@@ -9,6 +9,7 @@ from torch import Tensor
 
 from dyngs.core.camera import Cameras
 from dyngs.ops.patches import PatchSamples, lattice
+from dyngs.ops.rasterization import Boundaries
 
 ORDER = (2, 0, 0), (1, 1, 0), (1, 0, 1), (0, 2, 0), (0, 1, 1), (0, 0, 2)
 
@@ -94,3 +95,28 @@ def reference_blend(
                 pixels.append(mixed / total.clamp_min(1))
     image = torch.stack(pixels).view(views, height, width, -1)
     return image[..., :-1], image[..., -1]
+
+
+NOISE = 0.1  # px; nearer samples get no gradient
+
+
+def reference_weights(given: Boundaries) -> Tensor:
+    """(1, N, H, W) weights of Gaussians at pixels: every sample of their patches is tried."""
+    height, width = given.shown.shape
+    rows, columns = (torch.arange(n, dtype=given.samples.dtype) + 0.5 for n in (height, width))
+    centres = torch.stack(torch.meshgrid(rows, columns, indexing="ij")[::-1], -1)
+    weights: list[Tensor] = []
+    for owner in given.owners.tolist():
+        inside = given.shown == owner
+        weight = inside.to(centres)
+        own = given.samples[given.ids == owner]
+        if len(own):
+            squared = (own[:, None, None] - centres).square().sum(-1)
+            nearest = squared.detach().argmin(0, keepdim=True)
+            distance = squared.gather(0, nearest)[0].clamp_min(1e-30).sqrt()
+            distance = torch.where(distance < NOISE, distance.detach(), distance)
+            rho = distance / given.radius
+            half = 2 ** (rho - 1)
+            weight = torch.where(rho < 1, torch.where(inside, half, 1 - half), weight)
+        weights.append(weight)
+    return torch.stack(weights)[None]

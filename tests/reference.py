@@ -130,10 +130,14 @@ def rasterize(
     *,
     background: Tensor | None = None,
     options: BlendOptions = BlendOptions(),
+    weights: Tensor | None = None,
 ) -> BlendedImages:
-    """Reference of ``dyngs.ops.rasterization.rasterize`` without probe: a loop over Gaussians."""
+    """Reference of ``dyngs.ops.rasterization.rasterize`` without probe: a loop over Gaussians.
+
+    ``weights``: factors (V, N, H, W) of alpha.
+    """
     raised = colors.new_zeros(*opacities.shape, size[1], size[0])
-    return _rasterize(projection, opacities, colors, raised, background, options)
+    return _rasterize(projection, opacities, colors, raised, background, options, weights)
 
 
 def squared_slopes(
@@ -163,6 +167,7 @@ def _rasterize(
     raised: Tensor,
     background: Tensor | None,
     options: BlendOptions,
+    weights: Tensor | None = None,
 ) -> BlendedImages:
     """``rasterize`` with ``raised`` (V, N, H, W) added to the value of each 2D Gaussian per pixel."""
     height, width = raised.shape[2:]
@@ -182,7 +187,10 @@ def _rasterize(
             dx = projection.means2d[v, i, 0] - x
             dy = projection.means2d[v, i, 1] - y
             power = -0.5 * ((u_x * dx + u_y * dy) ** 2 + (v_y * dy) ** 2)
-            alpha = (opacities[v, i] * (power.exp() + raised[v, i])).clamp_max(options.alpha_max)
+            alpha = opacities[v, i] * (power.exp() + raised[v, i])
+            if weights is not None:
+                alpha = alpha * weights[v, i]
+            alpha = alpha.clamp_max(options.alpha_max)
             alpha = torch.where((alpha >= options.alpha_min) & ~full, alpha, 0.0)
             after = transmittance * (1 - alpha)
             full = full | ((after < options.transmittance_min) & (alpha > 0))

@@ -7,6 +7,7 @@
 #include "bind/arrays.hpp"
 #include "bind/results.hpp"
 #include "core/api.hpp"
+#include "core/triangles.hpp"
 #include "cpu/memory.hpp"
 
 namespace dyngs {
@@ -245,12 +246,32 @@ void bind_binning(nb::module_& module, const char* arrays_name) {
              });
 }
 
+// The patches that pixels show, those of Gaussians, samples of outlines, their patches, and the radius.
+template <class S>
+using BoundaryArrays = std::tuple<Array<const int32_t>, Array<const int32_t>, Array<const S>, Array<const int32_t>, double>;
+
+template <class S>
+Boundaries<S> checked_boundaries(const BoundaryArrays<S>& arrays, const Splats<S>& s) {
+  const auto& [shown, owners, samples, ids, radius] = arrays;
+  if (kOnGpu) throw nb::value_error("boundary weights run on the CPU only");
+  if (s.num_views != 1 || !(radius > 0 && radius <= 1e3))
+    throw nb::value_error("boundary weights need one view and a radius of at most 1000 px");
+  const auto count = static_cast<int64_t>(ids.size());
+  return {checked(shown, int64_t{s.width} * s.height, "shown"),
+          checked(owners, s.num_gaussians, "owners"),
+          checked(samples, 2 * count, "samples"),
+          ids.data(),
+          count,
+          static_cast<S>(radius)};
+}
+
 template <class S>
 void bind_blending(nb::module_& module) {
   using Arrays = SplatArrays<S>;
   module.def("rasterize_forward", [](const Arrays& in, Array<const S> colors, MaybeArray<const S> background,
                                      const EntryArrays& entries, const BlendSettings& settings,
-                                     std::tuple<Array<S>, Array<S>, Array<int32_t>, MaybeArray<S>> out, int tallied) {
+                                     std::tuple<Array<S>, Array<S>, Array<int32_t>, MaybeArray<S>> out, int tallied,
+                                     const std::optional<BoundaryArrays<S>>& bounds) {
     const Splats<S> s = in.with_colors(settings, colors);
     const int64_t pixels = s.num_views * s.width * s.height;
     const auto& [color, transmittance, stop, tally] = out;
@@ -263,6 +284,12 @@ void bind_blending(nb::module_& module) {
                          checked(tally, s.num_views * s.num_gaussians, "tally"),
                          static_cast<Tally>(tallied)};
     const Entries listed = checked_entries(entries, s);
+    if (bounds) {
+      const Boundaries<S> boundaries = checked_boundaries(*bounds, s);
+      nb::gil_scoped_release release;
+      if constexpr (!kOnGpu) rasterize_bounded_forward(s, listed, boundaries, image);
+      return;
+    }
     nb::gil_scoped_release release;
     rasterize_forward(s, listed, image);
   });
@@ -270,7 +297,8 @@ void bind_blending(nb::module_& module) {
       "rasterize_backward", [](const Arrays& in, Array<const S> colors, MaybeArray<const S> background,
                                const EntryArrays& entries, const BlendSettings& settings,
                                std::tuple<Array<const S>, Array<const S>, Array<const S>, Array<const int32_t>> grads,
-                               std::tuple<Array<S>, Array<S>, Array<S>, Array<S>, MaybeArray<S>> out, bool absolute) {
+                               std::tuple<Array<S>, Array<S>, Array<S>, Array<S>, MaybeArray<S>> out, bool absolute,
+                               const std::optional<BoundaryArrays<S>>& bounds, MaybeArray<S> g_samples) {
         const Splats<S> s = in.with_colors(settings, colors);
         const int64_t pixels = s.num_views * s.width * s.height, rows = s.num_views * s.num_gaussians;
         const auto& [g_color, g_transmittance, transmittance, stop] = grads;
@@ -284,6 +312,13 @@ void bind_blending(nb::module_& module) {
             checked(opacities, rows, "opacities gradient"), checked(g_colors, rows * s.channels, "colors gradient"),
             checked(probe, 4 * rows, "probe gradient"),     absolute};
         const Entries listed = checked_entries(entries, s);
+        if (bounds && g_samples) {
+          const Boundaries<S> boundaries = checked_boundaries(*bounds, s);
+          S* to_samples = checked(*g_samples, 2 * boundaries.count, "samples gradient");
+          nb::gil_scoped_release release;
+          if constexpr (!kOnGpu) rasterize_bounded_backward(s, listed, boundaries, from, to, to_samples);
+          return;
+        }
         nb::gil_scoped_release release;
         rasterize_backward(s, listed, from, to);
       });

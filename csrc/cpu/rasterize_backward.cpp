@@ -8,6 +8,7 @@
 // a slot holds those with u and v about the point of the image nearest to it, and only the total is moved to the centre.
 #include <memory>
 
+#include "cpu/boundaries.hpp"
 #include "cpu/lane_sums.hpp"
 #include "cpu/parallel.hpp"
 #include "cpu/tile.hpp"
@@ -79,13 +80,15 @@ Packet<S> relative_stop(const int32_t (&stop)[kLanes], int32_t chunk_begin) {
   return r;
 }
 
-// Adds one block's pixels to the sums of entry `i` of the chunk, whose anchor is the point (x, y).
-template <class S, int D, bool kAbsolute>
+// Adds one block's pixels to the sums of entry `i` of the chunk, whose anchor is the point (x, y). `log2_weight`, `by_weight`: of
+// its patch if bounded.
+template <class S, int D, bool kAbsolute, bool kBounded>
 DYNGS_INLINE void add_block(const BlendGaussian<S>& g, const S* color, int channels, int i, const LaneOffsets<S>& lane,
-                            const Vec2<S>& block, const Vec2<S>& anchor, S alpha_max, BlockPixels<S, D>& pixels,
-                            Packet<S>* sum) {
+                            const Vec2<S>& block, const Vec2<S>& anchor, S alpha_max, const Packet<S>* log2_weight,
+                            Packet<S>* by_weight, BlockPixels<S, D>& pixels, Packet<S>* sum) {
   using P = Packet<S>;
-  const P x = log2_alpha(g, g.x - block.x, g.y - block.y, lane.x, lane.y);
+  P x = log2_alpha(g, g.x - block.x, g.y - block.y, lane.x, lane.y);
+  if constexpr (kBounded) x += *log2_weight;
   const PacketMask<S> drawn = (x >= pixels.threshold) & (P(static_cast<S>(i)) < pixels.stop);
   const P raw = exp2(x);
   const P alpha = clamped_alpha(raw, P(alpha_max), drawn);
@@ -94,6 +97,7 @@ DYNGS_INLINE void add_block(const BlendGaussian<S>& g, const S* color, int chann
   const BlendGrad<P> grad = blend_vjp(raw, alpha, P(alpha_max), shade, pixels.behind);
   const P p = grad.by_log_alpha, dx = P(anchor.x - block.x) - lane.x, dy = P(anchor.y - block.y) - lane.y;
   const P px = p * dx, py = p * dy;
+  if constexpr (kBounded) *by_weight += p;
   sum[kOne] += p, sum[kX] += px, sum[kY] += py;
   sum[kXX] += px * dx, sum[kXY] += px * dy, sum[kYY] += py * dy;
   for (int c = 0; c < channels; ++c) sum[kBlendSums + c] += grad.weight * pixels.grad[c];
@@ -115,10 +119,11 @@ void write_moments(const Splats<S>& s, const Vec2<S>& anchor, const BlendGaussia
   blend_sums(sum, u, w, v, far, {double(near.x) - anchor.x, double(near.y) - anchor.y}, to);
 }
 
-// Entry `i` of the chunk in the blocks of the bits `touched`; writes its slot.
-template <class S, int D, bool kAbsolute>
+// Entry `i` of the chunk in the blocks of the bits `touched`; writes its slot. `owner`: its patch if bounded.
+template <class S, int D, bool kAbsolute, bool kBounded>
 void entry_backward(const Splats<S>& s, const TileFrame<S>& frame, const Chunk<S>& chunk, int i, uint32_t touched,
-                    const LaneOffsets<S>& lane, TileState<S, D>& state, S* slot) {
+                    int32_t owner, const BlockBoundary<S>* bounds, const LaneOffsets<S>& lane, TileState<S, D>& state,
+                    S* slot) {
   using P = Packet<S>;
   constexpr int kFixed = kBlendSums + (kAbsolute ? 2 : 0);
   const int channels = D == kDynamic ? s.channels : D;
@@ -131,8 +136,15 @@ void entry_backward(const Splats<S>& s, const TileFrame<S>& frame, const Chunk<S
   for (int f = 0; f < count; ++f) sum[f] = P(S(0));
   for (; touched != 0; touched &= touched - 1) {
     const int b = __builtin_ctz(touched);
-    add_block<S, D, kAbsolute>(g, color, channels, i, lane, {frame.block_x[b], frame.block_y[b]}, anchor, s.alpha_max,
-                               state.blocks[b], sum);
+    const P* log2_weight = nullptr;
+    P* by_weight = nullptr;
+    if constexpr (kBounded) {
+      const int at = bounds[b].find(owner);
+      if (at == bounds[b].count) continue;
+      log2_weight = bounds[b].log2_weights + at, by_weight = bounds[b].grads + at;
+    }
+    add_block<S, D, kAbsolute, kBounded>(g, color, channels, i, lane, {frame.block_x[b], frame.block_y[b]}, anchor,
+                                         s.alpha_max, log2_weight, by_weight, state.blocks[b], sum);
   }
   if constexpr (D == kDynamic) {
     for (int f = count; f % kLanes != 0; ++f) sum[f] = P(S(0));
@@ -148,8 +160,9 @@ void entry_backward(const Splats<S>& s, const TileFrame<S>& frame, const Chunk<S
   }
 }
 
-template <class S, int D, bool kAbsolute>
-void tile_backward(const Splats<S>& s, const Entries& entries, const ImageGrads<S>& image, int64_t tile, S* slots) {
+template <class S, int D, bool kAbsolute, bool kBounded>
+void tile_backward(const Splats<S>& s, const Entries& entries, BoundaryTable<S>* boundaries, const ImageGrads<S>& image,
+                   int64_t tile, S* slots) {
   const TileFrame<S> frame = tile_frame(s, tile);
   const int64_t begin = entries.tile_offsets[tile], end = entries.tile_offsets[tile + 1];
   if (begin == end) return;
@@ -157,6 +170,8 @@ void tile_backward(const Splats<S>& s, const Entries& entries, const ImageGrads<
   TileState<S, D> state;
   for (int b = 0; b < kBlocks; ++b)
     if (frame.inside >> b & 1) load_pixels(s, frame, b, image, state);
+  BlockBoundary<S> bounds[kBlocks];
+  if constexpr (kBounded) boundaries->load_tile(frame, bounds);
   Chunk<S> chunk;
   const LaneOffsets<S> lane;
   for (int64_t at = begin + (end - begin - 1) / kChunk * kChunk; at >= begin; at -= kChunk) {
@@ -175,7 +190,9 @@ void tile_backward(const Splats<S>& s, const Entries& entries, const ImageGrads<
       if (touched == 0)  // behind what the pixels see
         std::fill(slot, slot + fields, S(0));
       else
-        entry_backward<S, D, kAbsolute>(s, frame, chunk, i, touched, lane, state, slot);
+        entry_backward<S, D, kAbsolute, kBounded>(s, frame, chunk, i, touched,
+                                                  kBounded ? boundaries->owner(entries.gaussians[at + i]) : 0, bounds,
+                                                  lane, state, slot);
     }
   }
 }
@@ -219,13 +236,15 @@ void sum_slots(const Splats<S>& s, int num_fields, const Entries& entries, const
   });
 }
 
-template <class S, int D, bool kAbsolute>
-void backward(const Splats<S>& s, const Entries& entries, const ImageGrads<S>& image, const SplatGrads<S>& out) {
+template <class S, int D, bool kAbsolute, bool kBounded = false>
+void backward(const Splats<S>& s, const Entries& entries, const ImageGrads<S>& image, const SplatGrads<S>& out,
+              BoundaryTable<S>* boundaries = nullptr) {
   constexpr int kFixed = kBlendSums + (kAbsolute ? 2 : 0);
   const int fields = kFixed + s.channels;
   const auto slots = std::make_unique_for_overwrite<S[]>(static_cast<size_t>(entries.count) * fields);
   parallel_for(s.tiles(), 1, s.threads, [&](int64_t begin, int64_t end) {
-    for (int64_t t = begin; t < end; ++t) tile_backward<S, D, kAbsolute>(s, entries, image, t, slots.get());
+    for (int64_t t = begin; t < end; ++t)
+      tile_backward<S, D, kAbsolute, kBounded>(s, entries, boundaries, image, t, slots.get());
   });
   sum_slots<S, D == kDynamic ? 0 : kFixed + D>(s, fields, entries, slots.get(), out);
 }
@@ -250,9 +269,22 @@ void rasterize_backward(const Splats<S>& s, const Entries& entries, const ImageG
                : backward_of_channels<S, false>(s, entries, image, out);
 }
 
+template <class S>
+void rasterize_bounded_backward(const Splats<S>& s, const Entries& entries, const Boundaries<S>& boundaries,
+                                const ImageGrads<S>& image, const SplatGrads<S>& out, S* g_samples) {
+  BoundaryTable<S> table(boundaries, s.width, s.height, s.threads);
+  s.channels == 3 ? backward<S, 3, false, true>(s, entries, image, out, &table)
+                  : backward<S, kDynamic, false, true>(s, entries, image, out, &table);
+  table.sample_grads(g_samples);
+}
+
 template void rasterize_backward<float>(const Splats<float>&, const Entries&, const ImageGrads<float>&,
                                         const SplatGrads<float>&);
 template void rasterize_backward<double>(const Splats<double>&, const Entries&, const ImageGrads<double>&,
                                          const SplatGrads<double>&);
+template void rasterize_bounded_backward<float>(const Splats<float>&, const Entries&, const Boundaries<float>&,
+                                                const ImageGrads<float>&, const SplatGrads<float>&, float*);
+template void rasterize_bounded_backward<double>(const Splats<double>&, const Entries&, const Boundaries<double>&,
+                                                 const ImageGrads<double>&, const SplatGrads<double>&, double*);
 
 }  // namespace dyngs

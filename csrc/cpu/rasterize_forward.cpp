@@ -2,6 +2,7 @@
 // registers while the block's own list is walked.
 #include <numeric>
 
+#include "cpu/boundaries.hpp"
 #include "cpu/parallel.hpp"
 #include "cpu/tile.hpp"
 
@@ -20,7 +21,8 @@ template <class S>
 struct Scratch {
   Chunk<S> chunk;
   uint16_t list[kChunk + 16];
-  S sums[kChunk];  // tallies of the chunk's Gaussians
+  S sums[kChunk];           // tallies of the chunk's Gaussians
+  int32_t owners[kChunk];  // their patches, if bounded
 };
 
 // Closes pixels that the Gaussian would take below transmittance_min.
@@ -31,9 +33,9 @@ void mark_full(PacketMask<S> full, int32_t position, BlockState<S, D>& state) {
   for (; bits != 0; bits &= bits - 1) state.stop[__builtin_ctz(bits)] = position;
 }
 
-template <class S, int D, Tally kTally>
+template <class S, int D, Tally kTally, bool kBounded>
 void blend_block(const Splats<S>& s, const TileFrame<S>& frame, int block, int32_t chunk_begin, int listed,
-                 Scratch<S>& scratch, BlockState<S, D>& block_state) {
+                 const BlockBoundary<S>& boundary, Scratch<S>& scratch, BlockState<S, D>& block_state) {
   using P = Packet<S>;
   const int channels = D == kDynamic ? s.channels : D;
   const LaneOffsets<S> lane;
@@ -43,7 +45,12 @@ void blend_block(const Splats<S>& s, const TileFrame<S>& frame, int block, int32
   for (int k = 0; k < listed; ++k) {
     const int i = scratch.list[k];
     const BlendGaussian<S>& g = scratch.chunk.gaussians[i];
-    const P x = log2_alpha(g, g.x - px, g.y - py, lane.x, lane.y);
+    P x = log2_alpha(g, g.x - px, g.y - py, lane.x, lane.y);
+    if constexpr (kBounded) {
+      const int at = boundary.find(scratch.owners[i]);
+      if (at == boundary.count) continue;
+      x += boundary.log2_weights[at];
+    }
     const PacketMask<S> drawn = x >= state.threshold;
     const P alpha = clamped_alpha(exp2(x), alpha_max, drawn);
     const P before = state.transmittance;
@@ -122,8 +129,9 @@ void fill_tile(const Splats<S>& s, const TileFrame<S>& frame, const Image<S>& im
   }
 }
 
-template <class S, int D, Tally kTally>
-void blend_tile(const Splats<S>& s, const Entries& entries, const Image<S>& image, int64_t tile, S* slot_sums) {
+template <class S, int D, Tally kTally, bool kBounded>
+void blend_tile(const Splats<S>& s, const Entries& entries, BoundaryTable<S>* boundaries, const Image<S>& image,
+                int64_t tile, S* slot_sums) {
   const TileFrame<S> frame = tile_frame(s, tile);
   const int64_t begin = entries.tile_offsets[tile], end = entries.tile_offsets[tile + 1];
   if (begin == end) return fill_tile(s, frame, image);
@@ -135,15 +143,20 @@ void blend_tile(const Splats<S>& s, const Entries& entries, const Image<S>& imag
     std::fill(state[b].stop, state[b].stop + kLanes, std::numeric_limits<int32_t>::max());
     if constexpr (kTally == Tally::kSquaredSlopes) state[b].behind = light_of_block(s, frame, b, image);
   }
+  BlockBoundary<S> bounds[kBlocks];
+  if constexpr (kBounded) boundaries->load_tile(frame, bounds);
   Scratch<S> scratch;
   uint32_t open = frame.inside;
   for (int64_t at = begin; at < end && open != 0; at += kChunk) {
     load_chunk<D>(s, entries, frame, at, static_cast<int>(std::min<int64_t>(kChunk, end - at)), scratch.chunk);
     if constexpr (kTally != Tally::kNone) std::fill(scratch.sums, scratch.sums + kChunk, S(0));
+    for (int i = 0; kBounded && i < scratch.chunk.count; ++i)
+      scratch.owners[i] = boundaries->owner(entries.gaussians[at + i]);
     for (int b = 0; b < kBlocks; ++b) {
       if (!(open >> b & 1)) continue;
       const int listed = scratch.chunk.list_block(b, scratch.list);
-      blend_block<S, D, kTally>(s, frame, b, static_cast<int32_t>(at - begin), listed, scratch, state[b]);
+      blend_block<S, D, kTally, kBounded>(s, frame, b, static_cast<int32_t>(at - begin), listed, bounds[b], scratch,
+                                          state[b]);
       if (!any_open(state[b])) open &= ~(1u << b);
     }
     if constexpr (kTally != Tally::kNone)
@@ -153,10 +166,12 @@ void blend_tile(const Splats<S>& s, const Entries& entries, const Image<S>& imag
     if (frame.inside >> b & 1) write_block(s, frame, b, image, state[b]);
 }
 
-template <class S, int D, Tally kTally>
-void blend_all(const Splats<S>& s, const Entries& entries, const Image<S>& image, S* slot_sums) {
+template <class S, int D, Tally kTally, bool kBounded = false>
+void blend_all(const Splats<S>& s, const Entries& entries, const Image<S>& image, S* slot_sums,
+               BoundaryTable<S>* boundaries = nullptr) {
   parallel_for(s.tiles(), 1, s.threads, [&](int64_t begin, int64_t end) {
-    for (int64_t t = begin; t < end; ++t) blend_tile<S, D, kTally>(s, entries, image, t, slot_sums);
+    for (int64_t t = begin; t < end; ++t)
+      blend_tile<S, D, kTally, kBounded>(s, entries, boundaries, image, t, slot_sums);
   });
 }
 
@@ -197,7 +212,19 @@ void rasterize_forward(const Splats<S>& s, const Entries& entries, const Image<S
   }
 }
 
+template <class S>
+void rasterize_bounded_forward(const Splats<S>& s, const Entries& entries, const Boundaries<S>& boundaries,
+                               const Image<S>& image) {
+  BoundaryTable<S> table(boundaries, s.width, s.height, s.threads);
+  s.channels == 3 ? blend_all<S, 3, Tally::kNone, true>(s, entries, image, nullptr, &table)
+                  : blend_all<S, kDynamic, Tally::kNone, true>(s, entries, image, nullptr, &table);
+}
+
 template void rasterize_forward<float>(const Splats<float>&, const Entries&, const Image<float>&);
 template void rasterize_forward<double>(const Splats<double>&, const Entries&, const Image<double>&);
+template void rasterize_bounded_forward<float>(const Splats<float>&, const Entries&, const Boundaries<float>&,
+                                               const Image<float>&);
+template void rasterize_bounded_forward<double>(const Splats<double>&, const Entries&, const Boundaries<double>&,
+                                                const Image<double>&);
 
 }  // namespace dyngs

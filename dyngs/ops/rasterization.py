@@ -78,6 +78,23 @@ class TileEntries:
 
 
 @dataclass(frozen=True)
+class Boundaries:
+    """Outlines of patches in one view, of Gaussians that lie on patches (Wu et al. 2025).
+
+    The alpha of a Gaussian at a pixel is multiplied by a weight, which depends on rho, the distance
+    in ``radius`` of the pixel from the nearest sample of the outline of the Gaussian's patch (the
+    first of several): 2^rho / 2 if the pixel shows the patch, else 1 - 2^rho / 2. If rho >= 1, it
+    is 1 or 0.
+    """
+
+    shown: Tensor  # (H, W) int32 patch that each pixel shows; -1: nothing
+    owners: Tensor  # (N,) int32 patch of each Gaussian
+    samples: Tensor  # (B, 2) px points of outlines
+    ids: Tensor  # (B,) int32 their patches
+    radius: float  # px
+
+
+@dataclass(frozen=True)
 class BlendedImages:
     """V blended images of D channels."""
 
@@ -150,6 +167,7 @@ def _blend(
     colors: Tensor,
     background: Tensor | None,
     probe: Tensor | None,
+    samples: Tensor | None,
     radii: Tensor,
     tile_offsets: Tensor,
     slot_ranges: Tensor,
@@ -158,19 +176,28 @@ def _blend(
     size: list[int],
     thresholds: list[float],
     absgrad: bool,
+    patches: list[Tensor],
+    radius: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
     image = _image(colors, size)
     splats = _arrays(means2d, factors, opacities, radii)
     entries = (tile_offsets, slot_ranges, gaussians, slots)
     settings = _settings(size, thresholds)
     given = splats, colors, background, entries, settings, (*image, None), 0
-    call_core(colors, "rasterize_forward", *given)
+    call_core(colors, "rasterize_forward", *given, _boundaries(samples, patches, radius))
     return image
 
 
+def _boundaries(samples: Tensor | None, patches: list[Tensor], radius: float) -> object:
+    if samples is None:
+        return None
+    shown, owners, ids = patches
+    return shown, owners, samples, ids, radius
+
+
 def _blend_backward(x: Backward) -> Sequence[Tensor | None]:
-    means2d, factors, opacities, colors, background, _, radii = x.inputs[:7]
-    *entries, size, thresholds, absgrad = x.inputs[7:]
+    means2d, factors, opacities, colors, background, _, samples, radii = x.inputs[:8]
+    *entries, size, thresholds, absgrad, patches, radius = x.inputs[8:]
     transmittance, stop = x.outputs
     by_color, by_transmittance = x.grads
     pairs = entries[3].shape[0]
@@ -185,19 +212,21 @@ def _blend_backward(x: Backward) -> Sequence[Tensor | None]:
     given = _arrays(means2d, factors, opacities, radii), colors, background, tuple(entries)
     settings = _settings(size, thresholds)
     images = by_color, by_transmittance, transmittance, stop
-    results = (*out, by_probe), absgrad
+    by_samples = None if samples is None else empty_like(samples)
+    bounds = _boundaries(samples, patches, radius), by_samples
+    results = (*out, by_probe), absgrad, *bounds
     call_core(colors, "rasterize_backward", *given, settings, images, *results)
     by_background = None
     if x.needs[4]:
         by_background = torch.einsum("vhw,vhwd->vd", transmittance, by_color)
-    return *out, by_background, by_probe
+    return *out, by_background, by_probe, by_samples
 
 
 blend_op = register(
     "blend",
     _blend,
     _blend_backward,
-    "means2d factors opacities colors background probe",
+    "means2d factors opacities colors background probe samples",
     keeps=[1, 2],
     constant=[2],
 )
@@ -216,7 +245,7 @@ def _tally(
     image = *_image(colors, size), sums
     settings = _settings(size, thresholds)
     given = _arrays(*splats), colors, background, tuple(entries), settings, image, kind
-    call_core(colors, "rasterize_forward", *given)
+    call_core(colors, "rasterize_forward", *given, None)
     return sums, image[0], image[1]
 
 
@@ -246,11 +275,13 @@ def rasterize(
     probe: Tensor | None = None,
     options: BlendOptions = BlendOptions(),
     entries: TileEntries | None = None,
+    boundaries: Boundaries | None = None,
 ) -> BlendedImages:
     """Blend the splats front to back into V images of D channels.
 
-    Differentiable in means2d, factors, opacities, colors and background. ``opacities`` (V, N),
-    already compensated; ``colors`` (V, N, D), D up to 40; ``background`` (V, D), None: black.
+    Differentiable in means2d, factors, opacities, colors, background and the samples of
+    ``boundaries``, which need the CPU, one view and no ``probe``. ``opacities`` (V, N), already
+    compensated; ``colors`` (V, N, D), D up to 40; ``background`` (V, D), None: black.
     ``probe`` (V, N, 4) zeros, whose gradient is that of the 2D means in px and, with ``absgrad``,
     the sum of its absolute values over pixels. ``entries``: result of ``bin_tiles`` for the same
     splats. Raises DyngsError for too many channels, sides above 2^23 px, too many (Gaussian, tile)
@@ -270,6 +301,7 @@ def rasterize(
         colors,
         background,
         probe,
+        None if boundaries is None else boundaries.samples.contiguous(),
         projection.radii,
         entries.tile_offsets,
         entries.slot_ranges,
@@ -278,6 +310,8 @@ def rasterize(
         list(size),
         options.thresholds,
         options.absgrad,
+        [] if boundaries is None else [boundaries.shown, boundaries.owners, boundaries.ids],
+        0.0 if boundaries is None else boundaries.radius,
     )
     return BlendedImages(color, transmittance)
 

@@ -22,7 +22,9 @@ from dyngs.ops.native import kernel_threads
 from dyngs.ops.registration import _LIBRARY
 
 DIFFERENTIABLE = [name for name in CASES if name not in ("tally", "adam", "offsets")]
-COMPILED = [name for name in DIFFERENTIABLE if name not in ("field", "patches", "render")]
+COMPILED = [
+    name for name in DIFFERENTIABLE if name not in ("field", "patches", "render", "boundaries")
+]
 
 
 @pytest.mark.usefixtures("one_thread")

@@ -42,7 +42,19 @@ class BgTriangleModel(ModelSection):
         description="segments per edge of a triangle's texture, with linear interpolation",
     )
     supersampling: int = Field(
-        default=2, ge=1, le=4, description="pixels are the mean of this number squared of samples"
+        default=2,
+        ge=1,
+        le=4,
+        description="pixels of faces are the mean of this number squared of samples",
+    )
+    primitives: Literal["faces", "gaussians"] = Field(
+        default="faces",
+        description="faces: opaque, with anti-aliased outlines; gaussians: one Gaussian at each pixel's point "
+        "on the surface, splatted, as published",
+    )
+    boundary_weights: bool = Field(
+        default=True,
+        description="with model.primitives=gaussians, fade a triangle's Gaussians within two pixels of its outline",
     )
 
 

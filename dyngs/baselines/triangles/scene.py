@@ -1,12 +1,13 @@
 """Quadratic Bezier triangles: surface, colours, rendering and mesh export.
 
-Rendered by a z-buffer with blended edges. P triangles with K colours each: at the six control
-points while ``texture`` is 0, else at the points of a lattice.
+Rendered by a z-buffer, as faces with blended edges or as one Gaussian per pixel. P triangles with K
+colours each: at the six control points while ``texture`` is 0, else at the points of a lattice.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
@@ -41,19 +42,29 @@ from dyngs.ops.patches import (
     NUM_POINTS,
     SEGMENTS,
     PatchSamples,
+    ProjectedPoints,
     blend_patches,
     lattice,
     lattice_size,
     outline_crossings,
+    outline_pixels,
     patch_values,
     project_points,
     visible_patches,
 )
+from dyngs.ops.projection import ProjectionOptions, project
+from dyngs.ops.rasterization import Boundaries, rasterize
 
 CORNERS = (0, 3, 5)  # control points 200, 020, 002
 _EDGES = ((0, 3), (0, 5), (3, 5))  # corners around the control points 110, 101, 011
 _BETWEEN = (1, 2, 4)
 MAX_TEXTURE, MAX_DEGREE = 16, 4
+# Gaussians of pixels (Wu et al. 2025): opacity; log scales before and at the start of textures, for
+# a scene of half side 1; segments of the lattice of scales and rotations, three points per edge.
+OPACITY = 0.92
+UNTEXTURED_LOG_SCALE, FIRST_LOG_SCALE = -5.0, -6.0
+SHAPE_SEGMENTS = 2
+BOUNDARY_RADIUS = 2.0  # px; three standard deviations of the pixel filter, rounded up
 
 
 @dataclass(frozen=True)
@@ -65,6 +76,9 @@ class Patches:
     # (P, T - 1, 3) SH coefficients by view direction, without the constant term.
     harmonics: Tensor
     texture: int = 0  # segments of the colour lattice; 0: colours at the control points
+    # (P, 6, 3) log world units and (P, 6, 4) wxyz of Gaussians on a lattice; None: constants
+    log_scales: Tensor | None = None
+    quats: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.points)
@@ -81,12 +95,30 @@ class Patches:
     @property
     def tensors(self) -> Mapping[str, Tensor]:
         """Trained tensors by name; row i belongs to triangle i."""
-        return {"points": self.points, "colours": self.colours, "harmonics": self.harmonics}
+        own = {"points": self.points, "colours": self.colours, "harmonics": self.harmonics}
+        shapes = {"log_scales": self.log_scales, "quats": self.quats}
+        return own | {name: x for name, x in shapes.items() if x is not None}
 
     def colours_at(self, ids: Tensor, uv: Tensor) -> Tensor:
         """Return colours (N, 3) without harmonics at ``uv`` (N, 2) on triangles ``ids`` (N,)
         int32."""
         return patch_values(self.colours, ids, uv, self.texture)
+
+    def shapes_at(self, ids: Tensor, uv: Tensor, unit: float) -> tuple[Tensor, Tensor]:
+        """Return quaternions (N, 4) and scales (N, 3), world units, of Gaussians at ``uv`` (N, 2) on
+        triangles ``ids`` (N,) int32; ``unit``: half side of the scene."""
+        if self.log_scales is None or self.quats is None:
+            scales = uv.new_full((len(ids), 3), math.exp(UNTEXTURED_LOG_SCALE) * unit)
+            return uv.new_tensor([1.0, 0, 0, 0]).expand(len(ids), 4), scales
+        quats = patch_values(self.quats, ids, uv, SHAPE_SEGMENTS)
+        return quats, patch_values(self.log_scales, ids, uv, SHAPE_SEGMENTS).exp()
+
+    def with_shapes(self, unit: float) -> Patches:
+        """Add scales and rotations of Gaussians in a scene of half side ``unit``."""
+        shape = len(self), lattice_size(SHAPE_SEGMENTS)
+        scales = self.points.new_full((*shape, 3), FIRST_LOG_SCALE + math.log(unit))
+        quats = self.points.new_tensor([1.0, 0, 0, 0]).repeat(*shape, 1)
+        return replace(self, log_scales=scales, quats=quats)
 
     def with_texture(self, segments: int) -> Patches:
         """Resample the colours to a lattice of ``segments``."""
@@ -115,7 +147,13 @@ class Patches:
             raise ValueError(
                 f"invalid 'points' or 'harmonics': {count} triangles, {harmonics.shape[1]} terms"
             )
-        return Patches(points.clone(), colours.clone(), harmonics.clone(), texture)
+        patches = Patches(points.clone(), colours.clone(), harmonics.clone(), texture)
+        if "log_scales" not in stored:
+            return patches
+        places = lattice_size(SHAPE_SEGMENTS)
+        log_scales = require_tensor("log_scales", stored["log_scales"], (count, places, 3))
+        quats = require_tensor("quats", stored["quats"], (count, places, 4))
+        return replace(patches, log_scales=log_scales.clone(), quats=quats.clone())
 
 
 def evaluate_patches(values: Tensor, places: Tensor) -> Tensor:
@@ -160,6 +198,8 @@ class TriangleOptions(DrawOptions):
 
     segments: int = SEGMENTS  # per edge: a triangle is rendered as ``segments``^2 flat faces
     supersampling: int = 1  # a pixel is the mean of this squared number of samples
+    primitives: Literal["faces", "gaussians"] = "faces"
+    boundary_weights: bool = True  # of Gaussians near the outlines of their triangles
 
 
 @dataclass(frozen=True, repr=False)
@@ -258,22 +298,58 @@ class TriangleScene(Renderable):
         places = PatchSamples.of(
             *visible_patches(patches.points.detach(), fine, options.near, options.segments)
         )
-        at = project_points(
-            patch_values(patches.points, places.ids, places.uv), fine, torch.zeros_like(places.ids)
-        )
+        means = patch_values(patches.points, places.ids, places.uv)
+        at = project_points(means, fine, torch.zeros_like(places.ids))
         colours = patches.colours_at(places.ids, places.uv)
         if patches.harmonics.shape[1]:
             colours = colours + self._view_dependent_colours(camera)[places.ids.long()]
         channels = colours.clamp_min(0)
         if options.depth != "none":
             channels = torch.cat([channels, at.depths[:, None]], 1)
-        crossings = outline_crossings(patches.points, fine, places)
-        image, through = blend_patches(at.means, channels, crossings, places)
+        if options.primitives == "gaussians":
+            image, through = self._splat(means, at, channels, places, fine, options)
+        else:
+            crossings = outline_crossings(patches.points, fine, places)
+            image, through = blend_patches(at.means, channels, crossings, places)
         if times > 1:
             image = avg_pool2d(image.permute(0, 3, 1, 2), times).permute(0, 2, 3, 1)
             through = avg_pool2d(through[None], times)[0]
         depth = image[..., 3] if options.depth != "none" else None
         return composite_background(image[..., :3], through, depth, options, background), places
+
+    def _splat(
+        self,
+        means: Tensor,
+        at: ProjectedPoints,
+        channels: Tensor,
+        places: PatchSamples,
+        camera: Cameras,
+        options: TriangleOptions,
+    ) -> tuple[Tensor, Tensor]:
+        """Blend one Gaussian per sample; return an image (1, H, W, C) and its transmittance.
+
+        Args:
+            means: (N, 3) positions, world; ``at``: their projections.
+            channels: (N, C).
+        """
+        quats, scales = self.patches.shapes_at(places.ids, places.uv, self.unit)
+        opacities = means.new_full((len(means),), OPACITY)
+        limits = ProjectionOptions(near=options.near)
+        projection = project(means, quats, scales, opacities, camera, limits)
+        boundaries = None
+        if options.boundary_weights:
+            shown = torch.full_like(places.rows, -1)
+            covered = places.rows >= 0
+            shown[covered] = places.ids
+            outline = outline_pixels(shown)[covered]
+            boundaries = Boundaries(
+                shown[0], places.ids, at.means[outline], places.ids[outline], BOUNDARY_RADIUS
+            )
+        size = (camera.width, camera.height)
+        blended = rasterize(
+            projection, opacities[None], channels[None], size, boundaries=boundaries
+        )
+        return blended.color, blended.transmittance
 
     def _view_dependent_colours(self, camera: Cameras) -> Tensor:
         """Return the colours (P, 3) that harmonics add for ``camera``."""
@@ -289,7 +365,13 @@ class TriangleScene(Renderable):
 
 def scene_options(model: BgTriangleModel, unit: float) -> TriangleOptions:
     """Return the render options of triangles in a scene of half side ``unit``."""
-    return TriangleOptions(near=NEAR * unit, supersampling=model.supersampling)
+    faces = model.primitives == "faces"
+    return TriangleOptions(
+        near=NEAR * unit,
+        supersampling=model.supersampling if faces else 1,
+        primitives=model.primitives,
+        boundary_weights=model.boundary_weights,
+    )
 
 
 def restore_scene(model: BgTriangleModel, checkpoint: Checkpoint) -> TriangleScene:

@@ -13,6 +13,7 @@ from torch.nn.functional import conv2d, interpolate, max_pool2d
 from dyngs.baselines.triangles.kind import BgTriangleModel
 from dyngs.baselines.triangles.scene import (
     CORNERS,
+    SHAPE_SEGMENTS,
     Patches,
     TriangleOptions,
     TriangleScene,
@@ -332,6 +333,8 @@ POSITION_RATE, LAST_POSITION_RATE = 4e-3, 2e-4
 COLOUR_RATE = 0.01
 TEXTURE_FROM = 0.7  # fraction of the run after which textures are trained
 HARMONICS_DIVISOR = 20.0  # divisor of the colour learning rate
+# Learning rates of scales (log) and rotations of Gaussians while textures are trained
+SCALE_RATE, ROTATION_RATE = 0.015, 1e-3
 LAST_COLOUR = 0.1  # ratio of the last to the first colour learning rate of each phase
 VALUE_BYTES = 1.3  # file size per value
 MIN_TRIANGLES = 100  # fewest triangles that a size limit must allow
@@ -446,12 +449,21 @@ class TriangleTraining(Model[TriangleScene]):
         begun = self._first_texture if self.is_textured else 0
         end = self._steps if self.is_textured else self._first_texture
         colour = COLOUR_RATE * LAST_COLOUR ** min(1.0, max(0, step - begun) / max(1, end - begun))
-        return {"points": position, "colours": colour, "harmonics": colour / HARMONICS_DIVISOR}
+        return {
+            "points": position,
+            "colours": colour,
+            "harmonics": colour / HARMONICS_DIVISOR,
+            "log_scales": colour / COLOUR_RATE * SCALE_RATE,
+            "quats": colour / COLOUR_RATE * ROTATION_RATE,
+        }
 
     def _texture(self) -> None:
         """Switch to textures; other tensors keep their moments."""
         before = self._adam
-        self._begin(self._scene.patches.with_texture(self._model.texture))
+        patches = self._scene.patches.with_texture(self._model.texture)
+        if self._model.primitives == "gaussians":
+            patches = patches.with_shapes(self._scene.unit)
+        self._begin(patches)
         for name in ("points", "harmonics"):
             self._adam.exp_avg[name] = before.exp_avg[name]
             self._adam.exp_avg_sq[name] = before.exp_avg_sq[name]
@@ -513,6 +525,8 @@ def _limit_triangles(model: BgTriangleModel, megabytes: float | None) -> BgTrian
     if megabytes is None:
         return model
     values = 3 * (NUM_POINTS + lattice_size(model.texture) + num_sh_terms(model.sh_degree) - 1)
+    if model.primitives == "gaussians":
+        values += 7 * lattice_size(SHAPE_SEGMENTS)
     most = int(1e6 * megabytes / (VALUE_BYTES * values))
     if most < MIN_TRIANGLES:
         raise DyngsError(
