@@ -308,21 +308,22 @@ def boundaries_case(count: int, dtype: torch.dtype) -> Case:
     """Gaussians of three patches, weighted by the distance to samples of their outlines."""
     numbers = Numbers(dtype)
     width, height = 21, 18
-    shown = numbers.below(4, height, width).int() - 1
-    owners = numbers.below(3, count).int()
-    ids = numbers.below(3, 2 * count).int()
+    pixels = numbers.uniform(height * width).argsort()[:count]
+    rows = torch.full((height * width,), -1, dtype=torch.int32)
+    rows[pixels.sort().values] = torch.arange(len(pixels), dtype=torch.int32)
+    ids = numbers.below(3, count).int()
     depths = 1 + numbers.uniform(1, count)
     radii = torch.full((1, count, 2), 99, dtype=torch.int32)
     extent = torch.tensor([width, height], dtype=dtype)
     tilt = torch.tensor([0.4, 0.1, 0.5], dtype=dtype)
     inputs = [numbers.uniform(1, count, 2) * extent, tilt + 0.1 * numbers.uniform(1, count, 3)]
     inputs += [0.2 + 0.6 * numbers.uniform(1, count), numbers.uniform(1, count, 3)]
-    inputs += [numbers.uniform(2 * count, 2) * extent]
+    inputs += [numbers.uniform(count, 2) * extent]
     options = BlendOptions(alpha_min=0, transmittance_min=0)
 
     def run(*x: Tensor) -> list[Tensor]:
         projection = Projection(x[0], depths, x[1], torch.ones_like(depths), radii)
-        bounds = Boundaries(shown, owners, x[4], ids, 2.5)
+        bounds = Boundaries(rows.view(height, width), ids, x[4], 2.5)
         found = rasterize(
             projection, x[2], x[3], (width, height), options=options, boundaries=bounds
         )

@@ -101,15 +101,22 @@ NOISE = 0.1  # px; nearer samples get no gradient
 
 
 def reference_weights(given: Boundaries) -> Tensor:
-    """(1, N, H, W) weights of Gaussians at pixels: every sample of their patches is tried."""
-    height, width = given.shown.shape
+    """(1, N, H, W) weights of Gaussians at pixels: every outline sample of their patches is tried."""
+    height, width = given.rows.shape
+    shown = torch.where(given.rows >= 0, given.ids[given.rows.clamp_min(0).long()], -1)
+    outline = torch.zeros(len(given.ids), dtype=torch.bool)
+    for y in range(height):
+        for x in range(width):
+            around = shown[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2]
+            if given.rows[y, x] >= 0 and bool((around != shown[y, x]).any()):
+                outline[int(given.rows[y, x])] = True
     rows, columns = (torch.arange(n, dtype=given.samples.dtype) + 0.5 for n in (height, width))
     centres = torch.stack(torch.meshgrid(rows, columns, indexing="ij")[::-1], -1)
-    weights: list[Tensor] = []
-    for owner in given.owners.tolist():
-        inside = given.shown == owner
+    weights: dict[int, Tensor] = {}
+    for patch in given.ids.unique().tolist():
+        inside = shown == patch
         weight = inside.to(centres)
-        own = given.samples[given.ids == owner]
+        own = given.samples[outline & (given.ids == patch)]
         if len(own):
             squared = (own[:, None, None] - centres).square().sum(-1)
             nearest = squared.detach().argmin(0, keepdim=True)
@@ -118,5 +125,5 @@ def reference_weights(given: Boundaries) -> Tensor:
             rho = distance / given.radius
             half = 2 ** (rho - 1)
             weight = torch.where(rho < 1, torch.where(inside, half, 1 - half), weight)
-        weights.append(weight)
-    return torch.stack(weights)[None]
+        weights[patch] = weight
+    return torch.stack([weights[patch] for patch in given.ids.tolist()])[None]

@@ -246,53 +246,53 @@ void bind_binning(nb::module_& module, const char* arrays_name) {
              });
 }
 
-// The patches that pixels show, those of Gaussians, samples of outlines, their patches, and the radius.
+// The Gaussians of pixels, their patches, their samples, and the radius.
 template <class S>
-using BoundaryArrays = std::tuple<Array<const int32_t>, Array<const int32_t>, Array<const S>, Array<const int32_t>, double>;
+using BoundaryArrays = std::tuple<Array<const int32_t>, Array<const int32_t>, Array<const S>, double>;
 
 template <class S>
 Boundaries<S> checked_boundaries(const BoundaryArrays<S>& arrays, const Splats<S>& s) {
-  const auto& [shown, owners, samples, ids, radius] = arrays;
+  const auto& [rows, ids, samples, radius] = arrays;
   if (kOnGpu) throw nb::value_error("boundary weights run on the CPU only");
   if (s.num_views != 1 || !(radius > 0 && radius <= 1e3))
     throw nb::value_error("boundary weights need one view and a radius of at most 1000 px");
-  const auto count = static_cast<int64_t>(ids.size());
-  return {checked(shown, int64_t{s.width} * s.height, "shown"),
-          checked(owners, s.num_gaussians, "owners"),
-          checked(samples, 2 * count, "samples"),
-          ids.data(),
-          count,
-          static_cast<S>(radius)};
+  const int64_t pixels = int64_t{s.width} * s.height;
+  const Boundaries<S> found{checked(rows, pixels, "rows"), checked(ids, s.num_gaussians, "ids"),
+                            checked(samples, 2 * s.num_gaussians, "samples"), static_cast<S>(radius)};
+  for (int64_t i = 0; i < pixels; ++i)
+    if (found.rows[i] < -1 || found.rows[i] >= s.num_gaussians)
+      throw nb::value_error("rows name Gaussians that are not there");
+  return found;
 }
 
 template <class S>
 void bind_blending(nb::module_& module) {
   using Arrays = SplatArrays<S>;
-  module.def("rasterize_forward", [](const Arrays& in, Array<const S> colors, MaybeArray<const S> background,
-                                     const EntryArrays& entries, const BlendSettings& settings,
-                                     std::tuple<Array<S>, Array<S>, Array<int32_t>, MaybeArray<S>> out, int tallied,
-                                     const std::optional<BoundaryArrays<S>>& bounds) {
-    const Splats<S> s = in.with_colors(settings, colors);
-    const int64_t pixels = s.num_views * s.width * s.height;
-    const auto& [color, transmittance, stop, tally] = out;
-    if (tallied < 0 || tallied > 4 || tally.has_value() != (tallied > 0))
-      throw nb::value_error("rasterize: a tally needs its array");
-    const Image<S> image{checked(color, pixels * s.channels, "color"),
-                         checked(transmittance, pixels, "transmittance"),
-                         checked(stop, pixels, "stop"),
-                         checked(background, s.num_views * s.channels, "background"),
-                         checked(tally, s.num_views * s.num_gaussians, "tally"),
-                         static_cast<Tally>(tallied)};
-    const Entries listed = checked_entries(entries, s);
-    if (bounds) {
-      const Boundaries<S> boundaries = checked_boundaries(*bounds, s);
-      nb::gil_scoped_release release;
-      if constexpr (!kOnGpu) rasterize_bounded_forward(s, listed, boundaries, image);
-      return;
-    }
-    nb::gil_scoped_release release;
-    rasterize_forward(s, listed, image);
-  });
+  module.def("rasterize_forward",
+             [](const Arrays& in, Array<const S> colors, MaybeArray<const S> background, const EntryArrays& entries,
+                const BlendSettings& settings, std::tuple<Array<S>, Array<S>, Array<int32_t>, MaybeArray<S>> out,
+                int tallied, const std::optional<BoundaryArrays<S>>& bounds) {
+               const Splats<S> s = in.with_colors(settings, colors);
+               const int64_t pixels = s.num_views * s.width * s.height;
+               const auto& [color, transmittance, stop, tally] = out;
+               if (tallied < 0 || tallied > 4 || tally.has_value() != (tallied > 0))
+                 throw nb::value_error("rasterize: a tally needs its array");
+               const Image<S> image{checked(color, pixels * s.channels, "color"),
+                                    checked(transmittance, pixels, "transmittance"),
+                                    checked(stop, pixels, "stop"),
+                                    checked(background, s.num_views * s.channels, "background"),
+                                    checked(tally, s.num_views * s.num_gaussians, "tally"),
+                                    static_cast<Tally>(tallied)};
+               const Entries listed = checked_entries(entries, s);
+               if (bounds) {
+                 const Boundaries<S> boundaries = checked_boundaries(*bounds, s);
+                 nb::gil_scoped_release release;
+                 if constexpr (!kOnGpu) rasterize_bounded_forward(s, listed, boundaries, image);
+                 return;
+               }
+               nb::gil_scoped_release release;
+               rasterize_forward(s, listed, image);
+             });
   module.def(
       "rasterize_backward", [](const Arrays& in, Array<const S> colors, MaybeArray<const S> background,
                                const EntryArrays& entries, const BlendSettings& settings,
@@ -314,7 +314,7 @@ void bind_blending(nb::module_& module) {
         const Entries listed = checked_entries(entries, s);
         if (bounds && g_samples) {
           const Boundaries<S> boundaries = checked_boundaries(*bounds, s);
-          S* to_samples = checked(*g_samples, 2 * boundaries.count, "samples gradient");
+          S* to_samples = checked(*g_samples, 2 * s.num_gaussians, "samples gradient");
           nb::gil_scoped_release release;
           if constexpr (!kOnGpu) rasterize_bounded_backward(s, listed, boundaries, from, to, to_samples);
           return;

@@ -112,19 +112,17 @@ void blend_patches_forward(const PatchImage<S>& in, const BlendedPatches<S>& out
 template <class S>
 void blend_patches_backward(const PatchImage<S>& in, const BlendedPatches<const S>& grads, const PatchGrads<S>& out);
 
-// Gaussians that lie on patches, blended with the weights of math/boundary.hpp. One view.
+// Gaussians that lie on patches, one per covered pixel of one view, for the weights of math/boundary.hpp.
 template <class S>
 struct Boundaries {
-  const int32_t* shown;   // (H, W) patch that each pixel shows, -1: nothing
-  const int32_t* owners;  // (N,) patch of each Gaussian
-  const S* samples;       // (B, 2) px, on the outlines of patches
-  const int32_t* ids;     // (B,) their patches
-  int64_t count;          // B
-  S radius;               // px, positive
+  const int32_t* rows;  // (H, W) Gaussian of each pixel, -1: none
+  const int32_t* ids;   // (N,) its patch, not negative
+  const S* samples;     // (N, 2) px; those of pixels with another patch beside them are on outlines
+  S radius;             // px, positive
 };
 
 // As rasterize_forward and rasterize_backward, without tallies and probes; alpha is multiplied by the weight of the pixel and the
-// Gaussian's patch. Writes the gradients (B, 2) by the samples, for which the nearest sample of each pixel is held constant. CPU.
+// Gaussian's patch. Writes the gradients (N, 2) by the samples, for which the nearest sample of each pixel is held constant. CPU.
 template <class S>
 void rasterize_bounded_forward(const Splats<S>& splats, const Entries& entries, const Boundaries<S>& boundaries,
                                const Image<S>& image);

@@ -3,7 +3,6 @@
 #pragma once
 
 #include <array>
-#include <limits>
 #include <vector>
 
 #include "core/triangles.hpp"
@@ -17,14 +16,14 @@ namespace dyngs {
 template <class S>
 struct BlockBoundary {
   int count;
-  const int32_t* owners;          // (count,) patches
-  const Packet<S>* log2_weights;  // (count,)
-  Packet<S>* grads;               // (count,) sums of the gradient by log alpha
+  const int32_t* patches;    // (count,)
+  const Packet<S>* weights;  // (count,)
+  Packet<S>* grads;          // (count,) sums of the gradient by log alpha
 
-  // Where `owner` is in the lists; `count` if it is not.
-  int find(int32_t owner) const {
+  // Where `patch` is in the lists; `count` if it is not.
+  int find(int32_t patch) const {
     int at = 0;
-    while (at < count && owners[at] != owner) ++at;
+    while (at < count && patches[at] != patch) ++at;
     return at;
   }
 };
@@ -44,7 +43,7 @@ class BoundaryTable {
     });
   }
 
-  int32_t owner(int64_t gaussian) const { return in_.owners[gaussian]; }
+  int32_t patch(int64_t gaussian) const { return in_.ids[gaussian]; }
 
   // The patches of all blocks of a tile that lie in the image.
   void load_tile(const TileFrame<S>& frame, BlockBoundary<S> (&blocks)[kBlocks]) {
@@ -53,14 +52,14 @@ class BoundaryTable {
       if (!(frame.inside >> b & 1)) continue;
       Row& row = rows_[frame.y0 / kBlockSide + b / 4];
       const int column = frame.x0 / kBlockSide + b % 4, first = row.starts[column];
-      blocks[b] = {row.starts[column + 1] - first, row.owners.data() + first, row.log2_weights.data() + first,
+      blocks[b] = {row.starts[column + 1] - first, row.patches.data() + first, row.weights.data() + first,
                    row.grads.data() + first};
     }
   }
 
-  // Writes the gradients (B, 2) by the samples.
-  void sample_grads(S* out) const {
-    std::fill(out, out + 2 * in_.count, S(0));
+  // Writes the gradients (N, 2) by the samples.
+  void sample_grads(int64_t count, S* out) const {
+    std::fill(out, out + 2 * count, S(0));
     for (size_t r = 0; r < rows_.size(); ++r) {
       for (int column = 0; column < columns_; ++column) {
         for (int at = rows_[r].starts[column]; at < rows_[r].starts[column + 1]; ++at)
@@ -70,42 +69,58 @@ class BoundaryTable {
   }
 
  private:
-  using Nearest = std::array<int32_t, kLanes>;
+  using Nearest = std::array<int32_t, kLanes>;  // sample of each pixel, -1: none within the radius
 
   struct Row {
     std::vector<int32_t> starts;  // (columns + 1)
-    std::vector<int32_t> owners;
-    std::vector<Packet<S>> log2_weights, grads;
-    std::vector<Nearest> nearest;  // sample of each pixel, -1: none within the radius
+    std::vector<int32_t> patches;
+    std::vector<Packet<S>> weights, grads;
+    std::vector<Nearest> nearest;
   };
 
   // A patch of a block while its row is built.
   struct Candidate {
-    int32_t owner;
+    int32_t patch;
     int next;  // of the same block, -1: none
-    S squared[kLanes];
+    Packet<S> squared;
     Nearest nearest;
   };
 
   struct Candidates {
     explicit Candidates(int columns) : first(columns, -1), last(columns, -1) {}
 
-    Candidate& find(int column, int32_t owner) {
+    Candidate& find(int column, int32_t patch) {
       for (int at = first[column]; at >= 0; at = all[at].next)
-        if (all[at].owner == owner) return all[at];
+        if (all[at].patch == patch) return all[at];
       const int at = static_cast<int>(all.size());
       (first[column] < 0 ? first[column] : all[last[column]].next) = at;
       last[column] = at;
       Candidate& added = all.emplace_back();
-      added.owner = owner, added.next = -1;
-      std::fill(added.squared, added.squared + kLanes, kLargest<S>);
+      added.patch = patch, added.next = -1, added.squared = Packet<S>(kLargest<S>);
       added.nearest.fill(-1);
       return added;
     }
 
     std::vector<Candidate> all;
-    std::vector<int> first, last;
+    std::vector<int> first, last;  // of each column
   };
+
+  // The patch that a pixel shows, -1: nothing, or outside the image.
+  int32_t shown(int x, int y) const {
+    if (x < 0 || y < 0 || x >= width_ || y >= height_) return -1;
+    const int32_t row = in_.rows[int64_t{y} * width_ + x];
+    return row < 0 ? -1 : in_.ids[row];
+  }
+
+  // Whether one of the eight neighbours in the image shows another patch.
+  bool on_outline(int x, int y) const {
+    const int32_t own = shown(x, y);
+    for (int v = std::max(y - 1, 0); v <= std::min(y + 1, height_ - 1); ++v) {
+      for (int u = std::max(x - 1, 0); u <= std::min(x + 1, width_ - 1); ++u)
+        if (shown(u, v) != own) return true;
+    }
+    return false;
+  }
 
   // Integers [begin, end) whose centres may be within the radius.
   std::pair<int, int> around(S x, int size) const {
@@ -114,38 +129,48 @@ class BoundaryTable {
     return {static_cast<int>(low), std::min(static_cast<int>(high) + 1, size)};
   }
 
-  // The samples near each row of blocks, in their order.
+  // The samples of outlines near each row of blocks, in the order of their pixels.
   std::vector<std::vector<int32_t>> samples_of_rows() const {
     std::vector<std::vector<int32_t>> found(rows_.size());
-    for (int64_t n = 0; n < in_.count; ++n) {
-      const auto [begin, end] = around(in_.samples[2 * n + 1], height_);
-      for (int row = begin / kBlockSide; row * kBlockSide < end; ++row) found[row].push_back(static_cast<int32_t>(n));
+    for (int y = 0; y < height_; ++y) {
+      for (int x = 0; x < width_; ++x) {
+        const int32_t n = in_.rows[int64_t{y} * width_ + x];
+        if (n < 0 || !on_outline(x, y)) continue;
+        const auto [begin, end] = around(in_.samples[2 * n + 1], height_);
+        for (int row = begin / kBlockSide; row * kBlockSide < end; ++row) found[row].push_back(n);
+      }
     }
     return found;
   }
 
   // Not inlined: two copies, for one thread and for several, could round differently.
   [[gnu::noinline]] void build_row(int row, const std::vector<int32_t>& samples) {
+    using P = Packet<S>;
     Candidates found(columns_);
-    const int y0 = row * kBlockSide, y1 = std::min(y0 + kBlockSide, height_);
-    for (int y = y0; y < y1; ++y) {
+    const int y0 = row * kBlockSide;
+    for (int y = y0; y < std::min(y0 + kBlockSide, height_); ++y) {
+      int32_t before = -1;
       for (int x = 0; x < width_; ++x) {
-        const int32_t shown = in_.shown[int64_t{y} * width_ + x];
-        if (shown >= 0) found.find(x / kBlockSide, shown);
+        const int32_t patch = shown(x, y);
+        if (patch >= 0 && (patch != before || x % kBlockSide == 0)) found.find(x / kBlockSide, patch);
+        before = patch;
       }
     }
+    const LaneOffsets<S> lane;
+    const P limit(in_.radius * in_.radius);
     for (const int32_t n : samples) {
-      const auto [top, bottom] = around(in_.samples[2 * n + 1], height_);
-      const auto [left, right] = around(in_.samples[2 * n], width_);
-      for (int y = std::max(top, y0); y < std::min(bottom, y1); ++y) {
-        for (int x = left; x < right; ++x) {
-          const Vec2<S> offset = offset_from(n, x, y);
-          const S squared = offset.x * offset.x + offset.y * offset.y;
-          if (!(squared < in_.radius * in_.radius)) continue;
-          Candidate& of = found.find(x / kBlockSide, in_.ids[n]);
-          const int lane = (y - y0) * kBlockSide + x % kBlockSide;
-          if (squared < of.squared[lane]) of.squared[lane] = squared, of.nearest[lane] = n;
-        }
+      const S x = in_.samples[2 * n], y = in_.samples[2 * n + 1];
+      const P dy = P(y - (static_cast<S>(y0) + S(0.5))) - lane.y;
+      const auto [left, right] = around(x, width_);
+      for (int column = left / kBlockSide; column * kBlockSide < right; ++column) {
+        const P dx = P(x - (static_cast<S>(column * kBlockSide) + S(0.5))) - lane.x;
+        const P squared = dx * dx + dy * dy;
+        const PacketMask<S> near = squared < limit;
+        if (!any(near)) continue;
+        Candidate& of = found.find(column, in_.ids[n]);
+        const PacketMask<S> nearer = near & (squared < of.squared);
+        of.squared = select(nearer, squared, of.squared);
+        for (uint32_t bits = to_bits(nearer); bits != 0; bits &= bits - 1) of.nearest[__builtin_ctz(bits)] = n;
       }
     }
     pack(found, row);
@@ -153,34 +178,28 @@ class BoundaryTable {
 
   void pack(const Candidates& found, int row) {
     Row& to = rows_[row];
+    to.patches.reserve(found.all.size()), to.weights.reserve(found.all.size());
+    to.nearest.reserve(found.all.size());
     to.starts.assign(1, 0);
     for (int column = 0; column < columns_; ++column) {
+      int32_t patches[kLanes];
+      for (int i = 0; i < kLanes; ++i) patches[i] = shown_at(column, row, i);
       for (int at = found.first[column]; at >= 0; at = found.all[at].next) {
         const Candidate& from = found.all[at];
-        Packet<S> weights;
-        for (int i = 0; i < kLanes; ++i) {
-          const bool inside = shows(column, row, i, from.owner);
-          weights[i] = inside ? S(0) : -std::numeric_limits<S>::infinity();
-          if (from.nearest[i] >= 0) weights[i] = log2_boundary_weight(sqrt(from.squared[i]) / in_.radius, inside);
-        }
-        to.owners.push_back(from.owner);
-        to.log2_weights.push_back(weights);
+        Packet<S> shows;
+        for (int i = 0; i < kLanes; ++i) shows[i] = patches[i] == from.patch ? S(1) : S(0);
+        const Packet<S> rho = sqrt(from.squared) / Packet<S>(in_.radius);
+        to.patches.push_back(from.patch);
+        to.weights.push_back(boundary_weight(rho, shows > Packet<S>(S(0))));
         to.nearest.push_back(from.nearest);
       }
-      to.starts.push_back(static_cast<int32_t>(to.owners.size()));
+      to.starts.push_back(static_cast<int32_t>(to.patches.size()));
     }
-    to.grads.assign(to.owners.size(), Packet<S>(S(0)));
+    to.grads.assign(to.patches.size(), Packet<S>(S(0)));
   }
 
-  bool shows(int column, int row, int lane, int32_t owner) const {
-    const int x = column * kBlockSide + lane % kBlockSide, y = row * kBlockSide + lane / kBlockSide;
-    return x < width_ && y < height_ && in_.shown[int64_t{y} * width_ + x] == owner;
-  }
-
-  // From a pixel's centre to a sample.
-  Vec2<S> offset_from(int32_t sample, int x, int y) const {
-    return {in_.samples[2 * sample] - (static_cast<S>(x) + S(0.5)),
-            in_.samples[2 * sample + 1] - (static_cast<S>(y) + S(0.5))};
+  int32_t shown_at(int column, int row, int lane) const {
+    return shown(column * kBlockSide + lane % kBlockSide, row * kBlockSide + lane / kBlockSide);
   }
 
   void add_grads(const Row& from, int at, int column, int row, S* out) const {
@@ -188,14 +207,14 @@ class BoundaryTable {
       const int32_t n = from.nearest[at][i];
       const S by_log_weight = from.grads[at][i];
       if (n < 0 || by_log_weight == S(0)) continue;
-      const Vec2<S> offset =
-          offset_from(n, column * kBlockSide + i % kBlockSide, row * kBlockSide + i / kBlockSide);
-      const S distance = sqrt(offset.x * offset.x + offset.y * offset.y);
+      const S dx = in_.samples[2 * n] - (static_cast<S>(column * kBlockSide + i % kBlockSide) + S(0.5));
+      const S dy = in_.samples[2 * n + 1] - (static_cast<S>(row * kBlockSide + i / kBlockSide) + S(0.5));
+      const S distance = sqrt(dx * dx + dy * dy);
       if (distance < S(kLeastOffset)) continue;
-      const bool inside = shows(column, row, i, from.owners[at]);
-      const S slope = log2_boundary_slope(distance / in_.radius, inside) / S(kLog2E);
-      const S grad = by_log_weight * slope / (in_.radius * distance);
-      out[2 * n] += grad * offset.x, out[2 * n + 1] += grad * offset.y;
+      const bool inside = shown_at(column, row, i) == from.patches[at];
+      const S by_rho = by_log_weight * boundary_log_slope(from.weights[at][i], inside);
+      const S grad = by_rho / (in_.radius * distance);
+      out[2 * n] += grad * dx, out[2 * n + 1] += grad * dy;
     }
   }
 

@@ -80,24 +80,27 @@ Packet<S> relative_stop(const int32_t (&stop)[kLanes], int32_t chunk_begin) {
   return r;
 }
 
-// Adds one block's pixels to the sums of entry `i` of the chunk, whose anchor is the point (x, y). `log2_weight`, `by_weight`: of
-// its patch if bounded.
+// Adds one block's pixels to the sums of entry `i` of the chunk, whose anchor is the point (x, y). `bound`, `by_bound`: the
+// weights of its patch and the gradient by their logarithms, if bounded.
 template <class S, int D, bool kAbsolute, bool kBounded>
 DYNGS_INLINE void add_block(const BlendGaussian<S>& g, const S* color, int channels, int i, const LaneOffsets<S>& lane,
-                            const Vec2<S>& block, const Vec2<S>& anchor, S alpha_max, const Packet<S>* log2_weight,
-                            Packet<S>* by_weight, BlockPixels<S, D>& pixels, Packet<S>* sum) {
+                            const Vec2<S>& block, const Vec2<S>& anchor, S alpha_min, S alpha_max,
+                            const Packet<S>* bound, Packet<S>* by_bound, BlockPixels<S, D>& pixels, Packet<S>* sum) {
   using P = Packet<S>;
-  P x = log2_alpha(g, g.x - block.x, g.y - block.y, lane.x, lane.y);
-  if constexpr (kBounded) x += *log2_weight;
-  const PacketMask<S> drawn = (x >= pixels.threshold) & (P(static_cast<S>(i)) < pixels.stop);
-  const P raw = exp2(x);
+  const P x = log2_alpha(g, g.x - block.x, g.y - block.y, lane.x, lane.y);
+  PacketMask<S> drawn = (x >= pixels.threshold) & (P(static_cast<S>(i)) < pixels.stop);
+  P raw = exp2(x);
+  if constexpr (kBounded) {
+    raw = raw * *bound;
+    drawn = drawn & (raw >= P(alpha_min));
+  }
   const P alpha = clamped_alpha(raw, P(alpha_max), drawn);
   P shade(S(0));
   for (int c = 0; c < channels; ++c) shade += P(color[c]) * pixels.grad[c];
   const BlendGrad<P> grad = blend_vjp(raw, alpha, P(alpha_max), shade, pixels.behind);
   const P p = grad.by_log_alpha, dx = P(anchor.x - block.x) - lane.x, dy = P(anchor.y - block.y) - lane.y;
   const P px = p * dx, py = p * dy;
-  if constexpr (kBounded) *by_weight += p;
+  if constexpr (kBounded) *by_bound += p;
   sum[kOne] += p, sum[kX] += px, sum[kY] += py;
   sum[kXX] += px * dx, sum[kXY] += px * dy, sum[kYY] += py * dy;
   for (int c = 0; c < channels; ++c) sum[kBlendSums + c] += grad.weight * pixels.grad[c];
@@ -119,10 +122,10 @@ void write_moments(const Splats<S>& s, const Vec2<S>& anchor, const BlendGaussia
   blend_sums(sum, u, w, v, far, {double(near.x) - anchor.x, double(near.y) - anchor.y}, to);
 }
 
-// Entry `i` of the chunk in the blocks of the bits `touched`; writes its slot. `owner`: its patch if bounded.
+// Entry `i` of the chunk in the blocks of the bits `touched`; writes its slot. `patch`: of the Gaussian, if bounded.
 template <class S, int D, bool kAbsolute, bool kBounded>
 void entry_backward(const Splats<S>& s, const TileFrame<S>& frame, const Chunk<S>& chunk, int i, uint32_t touched,
-                    int32_t owner, const BlockBoundary<S>* bounds, const LaneOffsets<S>& lane, TileState<S, D>& state,
+                    int32_t patch, const BlockBoundary<S>* bounds, const LaneOffsets<S>& lane, TileState<S, D>& state,
                     S* slot) {
   using P = Packet<S>;
   constexpr int kFixed = kBlendSums + (kAbsolute ? 2 : 0);
@@ -136,15 +139,15 @@ void entry_backward(const Splats<S>& s, const TileFrame<S>& frame, const Chunk<S
   for (int f = 0; f < count; ++f) sum[f] = P(S(0));
   for (; touched != 0; touched &= touched - 1) {
     const int b = __builtin_ctz(touched);
-    const P* log2_weight = nullptr;
-    P* by_weight = nullptr;
+    const P* bound = nullptr;
+    P* by_bound = nullptr;
     if constexpr (kBounded) {
-      const int at = bounds[b].find(owner);
+      const int at = bounds[b].find(patch);
       if (at == bounds[b].count) continue;
-      log2_weight = bounds[b].log2_weights + at, by_weight = bounds[b].grads + at;
+      bound = bounds[b].weights + at, by_bound = bounds[b].grads + at;
     }
     add_block<S, D, kAbsolute, kBounded>(g, color, channels, i, lane, {frame.block_x[b], frame.block_y[b]}, anchor,
-                                         s.alpha_max, log2_weight, by_weight, state.blocks[b], sum);
+                                         s.alpha_min, s.alpha_max, bound, by_bound, state.blocks[b], sum);
   }
   if constexpr (D == kDynamic) {
     for (int f = count; f % kLanes != 0; ++f) sum[f] = P(S(0));
@@ -191,7 +194,7 @@ void tile_backward(const Splats<S>& s, const Entries& entries, BoundaryTable<S>*
         std::fill(slot, slot + fields, S(0));
       else
         entry_backward<S, D, kAbsolute, kBounded>(s, frame, chunk, i, touched,
-                                                  kBounded ? boundaries->owner(entries.gaussians[at + i]) : 0, bounds,
+                                                  kBounded ? boundaries->patch(entries.gaussians[at + i]) : 0, bounds,
                                                   lane, state, slot);
     }
   }
@@ -275,7 +278,7 @@ void rasterize_bounded_backward(const Splats<S>& s, const Entries& entries, cons
   BoundaryTable<S> table(boundaries, s.width, s.height, s.threads);
   s.channels == 3 ? backward<S, 3, false, true>(s, entries, image, out, &table)
                   : backward<S, kDynamic, false, true>(s, entries, image, out, &table);
-  table.sample_grads(g_samples);
+  table.sample_grads(s.num_gaussians, g_samples);
 }
 
 template void rasterize_backward<float>(const Splats<float>&, const Entries&, const ImageGrads<float>&,

@@ -22,7 +22,7 @@ struct Scratch {
   Chunk<S> chunk;
   uint16_t list[kChunk + 16];
   S sums[kChunk];           // tallies of the chunk's Gaussians
-  int32_t owners[kChunk];  // their patches, if bounded
+  int32_t patches[kChunk];  // of these Gaussians, if bounded
 };
 
 // Closes pixels that the Gaussian would take below transmittance_min.
@@ -45,14 +45,16 @@ void blend_block(const Splats<S>& s, const TileFrame<S>& frame, int block, int32
   for (int k = 0; k < listed; ++k) {
     const int i = scratch.list[k];
     const BlendGaussian<S>& g = scratch.chunk.gaussians[i];
-    P x = log2_alpha(g, g.x - px, g.y - py, lane.x, lane.y);
+    const P x = log2_alpha(g, g.x - px, g.y - py, lane.x, lane.y);
+    PacketMask<S> drawn = x >= state.threshold;
+    P raw = exp2(x);
     if constexpr (kBounded) {
-      const int at = boundary.find(scratch.owners[i]);
+      const int at = boundary.find(scratch.patches[i]);
       if (at == boundary.count) continue;
-      x += boundary.log2_weights[at];
+      raw = raw * boundary.weights[at];
+      drawn = drawn & (raw >= P(s.alpha_min));
     }
-    const PacketMask<S> drawn = x >= state.threshold;
-    const P alpha = clamped_alpha(exp2(x), alpha_max, drawn);
+    const P alpha = clamped_alpha(raw, alpha_max, drawn);
     const P before = state.transmittance;
     BlendStep<P> step = blend_step(alpha, before, transmittance_min);
     if (any(step.full)) [[unlikely]] {
@@ -151,7 +153,7 @@ void blend_tile(const Splats<S>& s, const Entries& entries, BoundaryTable<S>* bo
     load_chunk<D>(s, entries, frame, at, static_cast<int>(std::min<int64_t>(kChunk, end - at)), scratch.chunk);
     if constexpr (kTally != Tally::kNone) std::fill(scratch.sums, scratch.sums + kChunk, S(0));
     for (int i = 0; kBounded && i < scratch.chunk.count; ++i)
-      scratch.owners[i] = boundaries->owner(entries.gaussians[at + i]);
+      scratch.patches[i] = boundaries->patch(entries.gaussians[at + i]);
     for (int b = 0; b < kBlocks; ++b) {
       if (!(open >> b & 1)) continue;
       const int listed = scratch.chunk.list_block(b, scratch.list);

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
 from dyngs.core.camera import Cameras
 from dyngs.ops.registration import Backward, check_size, empty_like, launch, register
@@ -165,15 +164,6 @@ class PatchSamples:
         shown = ids >= 0
         rows = torch.where(shown, shown.flatten().cumsum(0).view(ids.shape) - 1, -1).to(torch.int32)
         return PatchSamples(rows, ids[shown], uv[shown])
-
-
-def outline_pixels(ids: Tensor) -> Tensor:
-    """Return a mask (V, H, W) of pixels that show a patch of ``ids`` (V, H, W), -1: nothing, and of
-    whose eight neighbours one shows another."""
-    shown = ids.float()[:, None]
-    highest = max_pool2d(shown, 3, 1, 1)
-    lowest = -max_pool2d(-shown, 3, 1, 1)
-    return (ids >= 0) & (highest != lowest)[:, 0]
 
 
 @dataclass(frozen=True)

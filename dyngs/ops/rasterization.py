@@ -79,18 +79,19 @@ class TileEntries:
 
 @dataclass(frozen=True)
 class Boundaries:
-    """Outlines of patches in one view, of Gaussians that lie on patches (Wu et al. 2025).
+    """Weights of Gaussians near the outlines of patches, in one view (Wu et al. 2025).
 
-    The alpha of a Gaussian at a pixel is multiplied by a weight, which depends on rho, the distance
-    in ``radius`` of the pixel from the nearest sample of the outline of the Gaussian's patch (the
-    first of several): 2^rho / 2 if the pixel shows the patch, else 1 - 2^rho / 2. If rho >= 1, it
-    is 1 or 0.
+    There is one Gaussian per covered pixel, on the patch that the pixel shows. The samples of
+    pixels with another patch or nothing beside them, diagonals included, are on the outline of the
+    patch. At a pixel, alpha is multiplied by a weight. rho is the distance in ``radius`` from the
+    nearest sample on the outline of the Gaussian's patch (the first pixel's of several). The weight
+    is 2^rho / 2 if the pixel shows the patch, else 1 - 2^rho / 2; 1 and 0 if rho >= 1. Samples
+    nearer than 0.1 px have no gradient.
     """
 
-    shown: Tensor  # (H, W) int32 patch that each pixel shows; -1: nothing
-    owners: Tensor  # (N,) int32 patch of each Gaussian
-    samples: Tensor  # (B, 2) px points of outlines
-    ids: Tensor  # (B,) int32 their patches
+    rows: Tensor  # (H, W) int32 Gaussian of each pixel; -1: none
+    ids: Tensor  # (N,) int32 its patch
+    samples: Tensor  # (N, 2) px, its place
     radius: float  # px
 
 
@@ -191,8 +192,7 @@ def _blend(
 def _boundaries(samples: Tensor | None, patches: list[Tensor], radius: float) -> object:
     if samples is None:
         return None
-    shown, owners, ids = patches
-    return shown, owners, samples, ids, radius
+    return *patches, samples, radius
 
 
 def _blend_backward(x: Backward) -> Sequence[Tensor | None]:
@@ -310,7 +310,7 @@ def rasterize(
         list(size),
         options.thresholds,
         options.absgrad,
-        [] if boundaries is None else [boundaries.shown, boundaries.owners, boundaries.ids],
+        [] if boundaries is None else [boundaries.rows, boundaries.ids],
         0.0 if boundaries is None else boundaries.radius,
     )
     return BlendedImages(color, transmittance)

@@ -42,12 +42,10 @@ from dyngs.ops.patches import (
     NUM_POINTS,
     SEGMENTS,
     PatchSamples,
-    ProjectedPoints,
     blend_patches,
     lattice,
     lattice_size,
     outline_crossings,
-    outline_pixels,
     patch_values,
     project_points,
     visible_patches,
@@ -299,56 +297,54 @@ class TriangleScene(Renderable):
             *visible_patches(patches.points.detach(), fine, options.near, options.segments)
         )
         means = patch_values(patches.points, places.ids, places.uv)
-        at = project_points(means, fine, torch.zeros_like(places.ids))
         colours = patches.colours_at(places.ids, places.uv)
         if patches.harmonics.shape[1]:
             colours = colours + self._view_dependent_colours(camera)[places.ids.long()]
-        channels = colours.clamp_min(0)
-        if options.depth != "none":
-            channels = torch.cat([channels, at.depths[:, None]], 1)
-        if options.primitives == "gaussians":
-            image, through = self._splat(means, at, channels, places, fine, options)
-        else:
-            crossings = outline_crossings(patches.points, fine, places)
-            image, through = blend_patches(at.means, channels, crossings, places)
+        blend = self._blend_faces if options.primitives == "faces" else self._splat
+        image, through = blend(means, colours.clamp_min(0), places, fine, options)
         if times > 1:
             image = avg_pool2d(image.permute(0, 3, 1, 2), times).permute(0, 2, 3, 1)
             through = avg_pool2d(through[None], times)[0]
         depth = image[..., 3] if options.depth != "none" else None
         return composite_background(image[..., :3], through, depth, options, background), places
 
-    def _splat(
+    def _blend_faces(
         self,
         means: Tensor,
-        at: ProjectedPoints,
-        channels: Tensor,
+        colours: Tensor,
         places: PatchSamples,
         camera: Cameras,
         options: TriangleOptions,
     ) -> tuple[Tensor, Tensor]:
-        """Blend one Gaussian per sample; return an image (1, H, W, C) and its transmittance.
+        """Return an image (1, H, W, 3 or 4), the last channel depth, and its transmittance.
 
-        Args:
-            means: (N, 3) positions, world; ``at``: their projections.
-            channels: (N, C).
+        ``means`` (N, 3), world, and ``colours`` (N, 3) of the samples.
         """
+        at = project_points(means, camera, torch.zeros_like(places.ids))
+        channels = _with_depths(colours, at.depths, options)
+        crossings = outline_crossings(self.patches.points, camera, places)
+        return blend_patches(at.means, channels, crossings, places)
+
+    def _splat(
+        self,
+        means: Tensor,
+        colours: Tensor,
+        places: PatchSamples,
+        camera: Cameras,
+        options: TriangleOptions,
+    ) -> tuple[Tensor, Tensor]:
+        """``_blend_faces`` with one Gaussian per sample instead."""
         quats, scales = self.patches.shapes_at(places.ids, places.uv, self.unit)
         opacities = means.new_full((len(means),), OPACITY)
         limits = ProjectionOptions(near=options.near)
         projection = project(means, quats, scales, opacities, camera, limits)
         boundaries = None
         if options.boundary_weights:
-            shown = torch.full_like(places.rows, -1)
-            covered = places.rows >= 0
-            shown[covered] = places.ids
-            outline = outline_pixels(shown)[covered]
-            boundaries = Boundaries(
-                shown[0], places.ids, at.means[outline], places.ids[outline], BOUNDARY_RADIUS
-            )
+            samples = projection.means2d[0]
+            boundaries = Boundaries(places.rows[0], places.ids, samples, BOUNDARY_RADIUS)
+        channels = _with_depths(colours, projection.depths[0], options)[None]
         size = (camera.width, camera.height)
-        blended = rasterize(
-            projection, opacities[None], channels[None], size, boundaries=boundaries
-        )
+        blended = rasterize(projection, opacities[None], channels, size, boundaries=boundaries)
         return blended.color, blended.transmittance
 
     def _view_dependent_colours(self, camera: Cameras) -> Tensor:
@@ -361,6 +357,13 @@ class TriangleScene(Renderable):
         return evaluate_harmonics(middles, camera.centers, sh, everywhere, patches.sh_degree)[0] - (
             _CLAMP_OFFSET + 0.5
         )
+
+
+def _with_depths(colours: Tensor, depths: Tensor, options: TriangleOptions) -> Tensor:
+    """Append ``depths`` (N,) to ``colours`` (N, 3) if they are rendered."""
+    if options.depth == "none":
+        return colours
+    return torch.cat([colours, depths[:, None]], 1)
 
 
 def scene_options(model: BgTriangleModel, unit: float) -> TriangleOptions:
