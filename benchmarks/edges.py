@@ -4,8 +4,8 @@
     dyngs train bg_triangle data.root=FOLDER run.dir=RUN
     python benchmarks/edges.py RUN [RUN ...]
 
-Prints for each run the numbers that it has learned, and PSNR and SSIM of the splits test and val;
-where the capture has images of true edges (the synthetic scene of polyhedra), PSNR of the pixels
+Prints for each run the numbers that it has learned, and PSNR, SSIM and FLIP of the splits test and
+val; where the capture has images of true edges (the synthetic scene of polyhedra), PSNR of the pixels
 within 2 px of one, too. There, val are close-ups from 40 % of the distance; other captures are
 enlarged as much by a run at 40 % of their size.
 """
@@ -23,7 +23,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from dyngs.baselines.triangles.scene import TriangleScene
-from dyngs.core.metrics import ssim
+from dyngs.core.metrics import flip, ssim
 from dyngs.core.state import Role
 from dyngs.data.capture import Split, View
 from dyngs.data.loader import ImageLoader
@@ -52,8 +52,8 @@ def num_values(scene: Renderable) -> int:
 
 @torch.no_grad()
 def errors(opened: OpenedScene, split: Split) -> list[float]:
-    """Return means over views: PSNR and SSIM of whole images, and PSNR near edges, NaN without
-    any."""
+    """Return means over views: PSNR, SSIM and FLIP of whole images, and PSNR near edges, NaN where
+    there is none."""
     options = opened.config.data.model_copy(update={"downscale": 1.0, "longest_side": None})
     views = opened.capture.splits[split]
     images = ImageLoader(views, options)
@@ -66,7 +66,9 @@ def errors(opened: OpenedScene, split: Split) -> list[float]:
         squared = (rendered - truth).square().mean(-1)
         near = near_edges(Path(opened.config.data.root), view)
         beside = float("nan") if near is None else _psnr(squared[near])
-        found.append([_psnr(squared), ssim(rendered, truth), beside])
+        perceived = flip(rendered, truth).value
+        different = float("nan") if perceived is None else perceived
+        found.append([_psnr(squared), ssim(rendered, truth), different, beside])
     return np.mean(found, axis=0).tolist()
 
 
@@ -84,9 +86,10 @@ def main(words: Sequence[str] | None = None) -> None:
         print(f"{path}: {num_values(opened.renderable):,} numbers")
         for split in SPLITS:
             if opened.capture.splits[split]:
-                whole, alike, near = errors(opened, split)
+                whole, alike, different, near = errors(opened, split)
                 print(
-                    f"  {split}: {whole:.2f} dB, SSIM {alike:.4f}, within {NEAR} px of edges {near:.2f} dB"
+                    f"  {split}: {whole:.2f} dB, SSIM {alike:.4f}, FLIP {different:.4f}, "
+                    f"within {NEAR} px of edges {near:.2f} dB"
                 )
 
 

@@ -149,7 +149,8 @@ def test_samples_at_pixel_centres_get_no_gradient() -> None:
 
 
 def test_samples_that_are_not_finite_are_ignored() -> None:
-    nan, infinite = float("nan"), float("inf")
+    nan = float("nan")
+    infinite = float("inf")
     alpha, points = single([[nan, 0.5], [1.5, -infinite], [4.0, 0.5]], ISLANDS)
     assert alpha[0].tolist() == pytest.approx(
         [0.5, 0, 0.5 * 2**-0.25, 0.5 * (1 - 2**-0.75), 0.5 * 2**-0.75]

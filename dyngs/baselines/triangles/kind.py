@@ -49,12 +49,13 @@ class BgTriangleModel(ModelSection):
     )
     primitives: Literal["faces", "gaussians"] = Field(
         default="faces",
-        description="faces: opaque, with anti-aliased outlines; gaussians: one Gaussian at each pixel's point "
-        "on the surface, splatted, as published",
+        description="faces: opaque, with anti-aliased outlines; gaussians: one Gaussian at each "
+        "pixel's point on the surface, splatted, as published",
     )
     boundary_weights: bool = Field(
         default=True,
-        description="with model.primitives=gaussians, fade a triangle's Gaussians within two pixels of its outline",
+        description="with model.primitives=gaussians, fade a triangle's Gaussians within two "
+        "pixels of its outline",
     )
 
 

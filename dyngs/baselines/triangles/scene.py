@@ -60,7 +60,8 @@ MAX_TEXTURE, MAX_DEGREE = 16, 4
 # Gaussians of pixels (Wu et al. 2025): opacity; log scales before and at the start of textures, for
 # a scene of half side 1; segments of the lattice of scales and rotations, three points per edge.
 OPACITY = 0.92
-UNTEXTURED_LOG_SCALE, FIRST_LOG_SCALE = -5.0, -6.0
+UNTEXTURED_LOG_SCALE = -5.0
+FIRST_LOG_SCALE = -6.0
 SHAPE_SEGMENTS = 2
 BOUNDARY_RADIUS = 2.0  # px; three standard deviations of the pixel filter, rounded up
 
