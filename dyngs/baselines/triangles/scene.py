@@ -57,11 +57,10 @@ CORNERS = (0, 3, 5)  # control points 200, 020, 002
 _EDGES = ((0, 3), (0, 5), (3, 5))  # corners around the control points 110, 101, 011
 _BETWEEN = (1, 2, 4)
 MAX_TEXTURE, MAX_DEGREE = 16, 4
-# Gaussians of pixels (Wu et al. 2025): opacity; log scales before and at the start of textures, for
-# a scene of half side 1; segments of the lattice of scales and rotations, three points per edge.
+# Gaussians of pixels (Wu et al. 2025): opacity; the ratio of scales at the start of textures to
+# those before; segments of the lattice of scales and rotations, three points per edge.
 OPACITY = 0.92
-UNTEXTURED_LOG_SCALE = -5.0
-FIRST_LOG_SCALE = -6.0
+FIRST_SCALE = math.exp(-1)
 SHAPE_SEGMENTS = 2
 BOUNDARY_RADIUS = 2.0  # px; three standard deviations of the pixel filter, rounded up
 
@@ -103,19 +102,19 @@ class Patches:
         int32."""
         return patch_values(self.colours, ids, uv, self.texture)
 
-    def shapes_at(self, ids: Tensor, uv: Tensor, unit: float) -> tuple[Tensor, Tensor]:
+    def shapes_at(self, ids: Tensor, uv: Tensor, scale: float) -> tuple[Tensor, Tensor]:
         """Return quaternions (N, 4) and scales (N, 3), world units, of Gaussians at ``uv`` (N, 2) on
-        triangles ``ids`` (N,) int32; ``unit``: half side of the scene."""
+        triangles ``ids`` (N,) int32; ``scale``: that of all without textures."""
         if self.log_scales is None or self.quats is None:
-            scales = uv.new_full((len(ids), 3), math.exp(UNTEXTURED_LOG_SCALE) * unit)
+            scales = uv.new_full((len(ids), 3), scale)
             return uv.new_tensor([1.0, 0, 0, 0]).expand(len(ids), 4), scales
         quats = patch_values(self.quats, ids, uv, SHAPE_SEGMENTS)
         return quats, patch_values(self.log_scales, ids, uv, SHAPE_SEGMENTS).exp()
 
-    def with_shapes(self, unit: float) -> Patches:
-        """Add scales and rotations of Gaussians in a scene of half side ``unit``."""
+    def with_shapes(self, scale: float) -> Patches:
+        """Add textures of scales, ``scale`` world units, and rotations of Gaussians."""
         shape = len(self), lattice_size(SHAPE_SEGMENTS)
-        scales = self.points.new_full((*shape, 3), FIRST_LOG_SCALE + math.log(unit))
+        scales = self.points.new_full((*shape, 3), math.log(scale))
         quats = self.points.new_tensor([1.0, 0, 0, 0]).repeat(*shape, 1)
         return replace(self, log_scales=scales, quats=quats)
 
@@ -203,12 +202,18 @@ class TriangleOptions(DrawOptions):
 
 @dataclass(frozen=True, repr=False)
 class TriangleScene(Renderable):
-    """Scene of triangles; ``unit``: half side of the scene, world units."""
+    """Scene of triangles.
+
+    Attributes:
+        unit: half side of the scene, world units.
+        scale: standard deviation of Gaussians without textures, world units.
+    """
 
     patches: Patches
     unit: float
     options: TriangleOptions = dataclasses.field(default_factory=TriangleOptions)
     background: Tensor | None = None
+    scale: float = 1.0
     surface_options: ClassVar[frozenset[str]] = frozenset()
 
     def __len__(self) -> int:
@@ -267,8 +272,11 @@ class TriangleScene(Renderable):
         return self.patches.points.device
 
     def state(self) -> State:
-        unit = {"unit": torch.tensor([self.unit], dtype=torch.float64, device="cpu")}
-        return add_prefix("triangles", self.patches.state() | with_role(unit, Role.SHARED))
+        sizes = {"unit": self.unit, "scale": self.scale}
+        own = {
+            name: torch.tensor([x], dtype=torch.float64, device="cpu") for name, x in sizes.items()
+        }
+        return add_prefix("triangles", self.patches.state() | with_role(own, Role.SHARED))
 
     def render(
         self,
@@ -335,7 +343,7 @@ class TriangleScene(Renderable):
         options: TriangleOptions,
     ) -> tuple[Tensor, Tensor]:
         """``_blend_faces`` with one Gaussian per sample instead."""
-        quats, scales = self.patches.shapes_at(places.ids, places.uv, self.unit)
+        quats, scales = self.patches.shapes_at(places.ids, places.uv, self.scale)
         opacities = means.new_full((len(means),), OPACITY)
         limits = ProjectionOptions(near=options.near)
         projection = project(means, quats, scales, opacities, camera, limits)
@@ -381,7 +389,12 @@ def scene_options(model: BgTriangleModel, unit: float) -> TriangleOptions:
 def restore_scene(model: BgTriangleModel, checkpoint: Checkpoint) -> TriangleScene:
     """Return the scene in a checkpoint. Raises KeyError or ValueError for inconsistent tensors."""
     stored = checkpoint.part("triangles")
-    unit = require_tensor("unit", stored["unit"], (1,), torch.float64)
-    half = float(require_positive("unit", unit))
+    half = _positive("unit", stored["unit"])
+    scale = _positive("scale", stored["scale"]) if "scale" in stored else 1.0
     behind = evaluation_background(checkpoint.info.background, False)[1]
-    return TriangleScene(Patches.from_state(stored), half, scene_options(model, half), behind)
+    options = scene_options(model, half)
+    return TriangleScene(Patches.from_state(stored), half, options, behind, scale)
+
+
+def _positive(name: str, value: Tensor) -> float:
+    return float(require_positive(name, require_tensor(name, value, (1,), torch.float64)))

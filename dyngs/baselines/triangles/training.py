@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -13,6 +14,7 @@ from torch.nn.functional import conv2d, interpolate, max_pool2d
 from dyngs.baselines.triangles.kind import BgTriangleModel
 from dyngs.baselines.triangles.scene import (
     CORNERS,
+    FIRST_SCALE,
     SHAPE_SEGMENTS,
     Patches,
     TriangleOptions,
@@ -335,6 +337,9 @@ TEXTURE_FROM = 0.7  # fraction of the run after which textures are trained
 HARMONICS_DIVISOR = 20.0  # divisor of the colour learning rate
 # Learning rates of scales (log) and rotations of Gaussians while textures are trained
 SCALE_RATE, ROTATION_RATE = 0.015, 1e-3
+# Standard deviation of Gaussians before textures, in half sides of the scene, in images of a side of
+# that many pixels (Wu et al. 2025); wider where pixels are larger.
+GAUSSIAN_SCALE, PUBLISHED_SIDE = math.exp(-5), 800
 LAST_COLOUR = 0.1  # ratio of the last to the first colour learning rate of each phase
 VALUE_BYTES = 1.3  # file size per value
 MIN_TRIANGLES = 100  # fewest triangles that a size limit must allow
@@ -359,7 +364,8 @@ class TriangleTraining(Model[TriangleScene]):
         self._awaits_surface = model.gaussian_steps > 0
         patches, unit = _initialize_at_points(run, model)
         behind = evaluation_background(config.data.background, run.capture.has_alpha)[1]
-        self._scene = TriangleScene(patches, unit, scene_options(model, unit), behind)
+        options = scene_options(model, unit)
+        self._scene = TriangleScene(patches, unit, options, behind, self._gaussian_scale(unit))
         self._begin(patches)
 
     def _begin(self, patches: Patches) -> None:
@@ -398,7 +404,8 @@ class TriangleTraining(Model[TriangleScene]):
             self._awaits_surface = False
             patches, unit = _initialize_on_surface(self._run, self._model)
             options = scene_options(self._model, unit)
-            self._scene = replace(self._scene, unit=unit, options=options)
+            scale = self._gaussian_scale(unit)
+            self._scene = replace(self._scene, unit=unit, options=options, scale=scale)
             self._begin(patches)
         options = replace(self._scene.options, depth="expected" if depth else "none")
         rendering, places = self._scene.render_view(image.cameras, options, background)
@@ -462,11 +469,15 @@ class TriangleTraining(Model[TriangleScene]):
         before = self._adam
         patches = self._scene.patches.with_texture(self._model.texture)
         if self._model.primitives == "gaussians":
-            patches = patches.with_shapes(self._scene.unit)
+            patches = patches.with_shapes(FIRST_SCALE * self._scene.scale)
         self._begin(patches)
         for name in ("points", "harmonics"):
             self._adam.exp_avg[name] = before.exp_avg[name]
             self._adam.exp_avg_sq[name] = before.exp_avg_sq[name]
+
+    def _gaussian_scale(self, unit: float) -> float:
+        camera = self._run.images[0].cameras
+        return GAUSSIAN_SCALE * unit * PUBLISHED_SIDE / max(camera.width, camera.height)
 
     def _finish(self, bad: Tensor | int) -> UpdateResult:
         """Prune triangles that no training view shows, after the last step."""

@@ -16,7 +16,7 @@ from torch import Tensor
 from dyngs.api.train import train
 from dyngs.baselines.triangles.scene import (
     BOUNDARY_RADIUS,
-    FIRST_LOG_SCALE,
+    FIRST_SCALE,
     OPACITY,
     SHAPE_SEGMENTS,
     Patches,
@@ -43,7 +43,7 @@ RED = torch.tensor([0.8, 0.1, 0.2])
 def doubled(patches: Patches) -> Patches:
     """With textures and random shapes, in float64, as leaves."""
     generator = torch.Generator().manual_seed(3)
-    shaped = patches.with_texture(2).with_shapes(4.0)
+    shaped = patches.with_texture(2).with_shapes(0.01)
     tensors = {name: x.double() for name, x in shaped.tensors.items()}
     for name in ("log_scales", "quats"):
         tensors[name] += 0.5 * torch.randn(tensors[name].shape, generator=generator).double()
@@ -100,7 +100,7 @@ def square() -> TriangleScene:
         ]
     )
     colours = RED.expand(2, 6, 3).clone()
-    return TriangleScene(Patches(points, colours, torch.zeros(2, 0, 3)), 8.0, WEIGHTED)
+    return TriangleScene(Patches(points, colours, torch.zeros(2, 0, 3)), 1.0, WEIGHTED, scale=0.05)
 
 
 def test_a_square_is_opaque_and_of_its_colour() -> None:
@@ -156,7 +156,7 @@ def test_training_learns_scales_and_rotations(run: Path) -> None:
     assert patches.log_scales is not None
     assert patches.quats is not None
     assert patches.log_scales.shape == (len(patches), len(lattice(SHAPE_SEGMENTS)[0]), 3)
-    first = FIRST_LOG_SCALE + torch.tensor(scene.unit).log()
+    first = torch.tensor(FIRST_SCALE * scene.scale).log()
     assert (patches.log_scales - first).abs().max() > 0.1
     assert patches.quats[..., 1:].abs().max() > 1e-3
 
@@ -176,7 +176,7 @@ def test_resume_equals_uninterrupted_run(capture: Path, tmp_path: Path, save_eve
 def test_two_threads_give_the_same_bytes() -> None:
     def gradients(threads: int) -> list[Tensor]:
         tensors = {name: x.clone().requires_grad_() for name, x in bent(40).tensors.items()}
-        scene = TriangleScene(replace(bent(40), **tensors), 1.0, WEIGHTED)
+        scene = TriangleScene(replace(bent(40), **tensors), 1.0, WEIGHTED, scale=0.05)
         with kernel_threads(threads):
             drawn = scene.render(camera(64)).rgb
             return [drawn, *torch.autograd.grad(drawn.square().sum(), list(tensors.values()))]
