@@ -52,6 +52,13 @@ class BgTriangleModel(ModelSection):
         description="faces: opaque, with anti-aliased outlines; gaussians: one Gaussian at each "
         "pixel's point on the surface, splatted, as published",
     )
+    gaussian_size: float = Field(
+        default=2.0,
+        gt=0,
+        le=100,
+        description="with model.primitives=gaussians, standard deviation of Gaussians before "
+        "textures, pixels at the centre of the scene; about 2 as published",
+    )
     boundary_weights: bool = Field(
         default=True,
         description="with model.primitives=gaussians, fade a triangle's Gaussians within two "

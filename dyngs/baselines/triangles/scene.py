@@ -1,7 +1,7 @@
 """Quadratic Bezier triangles: surface, colours, rendering and mesh export.
 
-Rendered by a z-buffer, as faces with blended edges or as one Gaussian per pixel. P triangles with K
-colours each: at the six control points while ``texture`` is 0, else at the points of a lattice.
+Rendered by a z-buffer, as faces with blended edges or as one Gaussian per pixel. P triangles with
+K colours each: at the six control points while ``texture`` is 0, else at the points of a lattice.
 """
 
 from __future__ import annotations
@@ -103,8 +103,8 @@ class Patches:
         return patch_values(self.colours, ids, uv, self.texture)
 
     def shapes_at(self, ids: Tensor, uv: Tensor, scale: float) -> tuple[Tensor, Tensor]:
-        """Return quaternions (N, 4) and scales (N, 3), world units, of Gaussians at ``uv`` (N, 2) on
-        triangles ``ids`` (N,) int32; ``scale``: that of all without textures."""
+        """Return quaternions (N, 4) and scales (N, 3), world units, of Gaussians at ``uv`` (N, 2)
+        on triangles ``ids`` (N,) int32; ``scale``: that of all without textures."""
         if self.log_scales is None or self.quats is None:
             scales = uv.new_full((len(ids), 3), scale)
             return uv.new_tensor([1.0, 0, 0, 0]).expand(len(ids), 4), scales

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from statistics import median
 from typing import Any
 
 import torch
@@ -56,7 +56,7 @@ from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import StartContext
 from dyngs.models.model import Model, RenderOutput, UpdateResult
 from dyngs.models.schedule import scale_step
-from dyngs.models.views import background_colour, evaluation_background
+from dyngs.models.views import background_colour, evaluation_background, training_cameras
 from dyngs.ops.loss import l1_ssim_loss
 from dyngs.ops.patches import NUM_POINTS, PatchSamples, lattice, lattice_size
 
@@ -337,9 +337,6 @@ TEXTURE_FROM = 0.7  # fraction of the run after which textures are trained
 HARMONICS_DIVISOR = 20.0  # divisor of the colour learning rate
 # Learning rates of scales (log) and rotations of Gaussians while textures are trained
 SCALE_RATE, ROTATION_RATE = 0.015, 1e-3
-# Standard deviation of Gaussians before textures, in half sides of the scene, in images of a side of
-# that many pixels (Wu et al. 2025); wider where pixels are larger.
-GAUSSIAN_SCALE, PUBLISHED_SIDE = math.exp(-5), 800
 LAST_COLOUR = 0.1  # ratio of the last to the first colour learning rate of each phase
 VALUE_BYTES = 1.3  # file size per value
 MIN_TRIANGLES = 100  # fewest triangles that a size limit must allow
@@ -365,7 +362,7 @@ class TriangleTraining(Model[TriangleScene]):
         patches, unit = _initialize_at_points(run, model)
         behind = evaluation_background(config.data.background, run.capture.has_alpha)[1]
         options = scene_options(model, unit)
-        self._scene = TriangleScene(patches, unit, options, behind, self._gaussian_scale(unit))
+        self._scene = TriangleScene(patches, unit, options, behind, self._gaussian_scale(patches))
         self._begin(patches)
 
     def _begin(self, patches: Patches) -> None:
@@ -404,7 +401,7 @@ class TriangleTraining(Model[TriangleScene]):
             self._awaits_surface = False
             patches, unit = _initialize_on_surface(self._run, self._model)
             options = scene_options(self._model, unit)
-            scale = self._gaussian_scale(unit)
+            scale = self._gaussian_scale(patches)
             self._scene = replace(self._scene, unit=unit, options=options, scale=scale)
             self._begin(patches)
         options = replace(self._scene.options, depth="expected" if depth else "none")
@@ -475,9 +472,15 @@ class TriangleTraining(Model[TriangleScene]):
             self._adam.exp_avg[name] = before.exp_avg[name]
             self._adam.exp_avg_sq[name] = before.exp_avg_sq[name]
 
-    def _gaussian_scale(self, unit: float) -> float:
-        camera = self._run.images[0].cameras
-        return GAUSSIAN_SCALE * unit * PUBLISHED_SIDE / max(camera.width, camera.height)
+    def _gaussian_scale(self, patches: Patches) -> float:
+        """Return the standard deviation of Gaussians before textures, world units."""
+        centre = patches.points.detach().mean((0, 1))
+        views = self._run.capture.splits["train"]
+        pixels = [
+            float((camera.centers[0] - centre).norm() / camera.intrinsics[0, 0, 0])
+            for camera in training_cameras(views, self._run.config.data)
+        ]
+        return self._model.gaussian_size * median(pixels)
 
     def _finish(self, bad: Tensor | int) -> UpdateResult:
         """Prune triangles that no training view shows, after the last step."""
