@@ -268,37 +268,40 @@ Boundaries<S> checked_boundaries(const BoundaryArrays<S>& arrays, const Splats<S
 template <class S>
 void bind_blending(nb::module_& module) {
   using Arrays = SplatArrays<S>;
-  module.def("rasterize_forward",
-             [](const Arrays& in, Array<const S> colors, MaybeArray<const S> background, const EntryArrays& entries,
-                const BlendSettings& settings, std::tuple<Array<S>, Array<S>, Array<int32_t>, MaybeArray<S>> out,
-                int tallied, const std::optional<BoundaryArrays<S>>& bounds) {
-               const Splats<S> s = in.with_colors(settings, colors);
-               const int64_t pixels = s.num_views * s.width * s.height;
-               const auto& [color, transmittance, stop, tally] = out;
-               if (tallied < 0 || tallied > 4 || tally.has_value() != (tallied > 0))
-                 throw nb::value_error("rasterize: a tally needs its array");
-               const Image<S> image{checked(color, pixels * s.channels, "color"),
-                                    checked(transmittance, pixels, "transmittance"),
-                                    checked(stop, pixels, "stop"),
-                                    checked(background, s.num_views * s.channels, "background"),
-                                    checked(tally, s.num_views * s.num_gaussians, "tally"),
-                                    static_cast<Tally>(tallied)};
-               const Entries listed = checked_entries(entries, s);
-               if (bounds) {
-                 const Boundaries<S> boundaries = checked_boundaries(*bounds, s);
-                 nb::gil_scoped_release release;
-                 if constexpr (!kOnGpu) rasterize_bounded_forward(s, listed, boundaries, image);
-                 return;
-               }
-               nb::gil_scoped_release release;
-               rasterize_forward(s, listed, image);
-             });
   module.def(
-      "rasterize_backward", [](const Arrays& in, Array<const S> colors, MaybeArray<const S> background,
-                               const EntryArrays& entries, const BlendSettings& settings,
-                               std::tuple<Array<const S>, Array<const S>, Array<const S>, Array<const int32_t>> grads,
-                               std::tuple<Array<S>, Array<S>, Array<S>, Array<S>, MaybeArray<S>> out, bool absolute,
-                               const std::optional<BoundaryArrays<S>>& bounds, MaybeArray<S> g_samples) {
+      "rasterize_forward",
+      [](const Arrays& in, Array<const S> colors, MaybeArray<const S> background, const EntryArrays& entries,
+         const BlendSettings& settings, std::tuple<Array<S>, Array<S>, Array<int32_t>, MaybeArray<S>> out, int tallied,
+         const std::optional<BoundaryArrays<S>>& bounds) {
+        const Splats<S> s = in.with_colors(settings, colors);
+        const int64_t pixels = s.num_views * s.width * s.height;
+        const auto& [color, transmittance, stop, tally] = out;
+        if (tallied < 0 || tallied > 4 || tally.has_value() != (tallied > 0))
+          throw nb::value_error("rasterize: a tally needs its array");
+        const Image<S> image{checked(color, pixels * s.channels, "color"),
+                             checked(transmittance, pixels, "transmittance"),
+                             checked(stop, pixels, "stop"),
+                             checked(background, s.num_views * s.channels, "background"),
+                             checked(tally, s.num_views * s.num_gaussians, "tally"),
+                             static_cast<Tally>(tallied)};
+        const Entries listed = checked_entries(entries, s);
+        if (bounds) {
+          const Boundaries<S> boundaries = checked_boundaries(*bounds, s);
+          nb::gil_scoped_release release;
+          if constexpr (!kOnGpu) rasterize_bounded_forward(s, listed, boundaries, image);
+          return;
+        }
+        nb::gil_scoped_release release;
+        rasterize_forward(s, listed, image);
+      },
+      nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg("bounds") = nb::none());
+  module.def(
+      "rasterize_backward",
+      [](const Arrays& in, Array<const S> colors, MaybeArray<const S> background, const EntryArrays& entries,
+         const BlendSettings& settings,
+         std::tuple<Array<const S>, Array<const S>, Array<const S>, Array<const int32_t>> grads,
+         std::tuple<Array<S>, Array<S>, Array<S>, Array<S>, MaybeArray<S>> out, bool absolute,
+         const std::optional<BoundaryArrays<S>>& bounds, MaybeArray<S> g_samples) {
         const Splats<S> s = in.with_colors(settings, colors);
         const int64_t pixels = s.num_views * s.width * s.height, rows = s.num_views * s.num_gaussians;
         const auto& [g_color, g_transmittance, transmittance, stop] = grads;
@@ -321,7 +324,9 @@ void bind_blending(nb::module_& module) {
         }
         nb::gil_scoped_release release;
         rasterize_backward(s, listed, from, to);
-      });
+      },
+      nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(),
+      nb::arg("bounds") = nb::none(), nb::arg("g_samples") = nb::none());
 }
 
 }  // namespace

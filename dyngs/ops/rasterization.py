@@ -185,14 +185,12 @@ def _blend(
     entries = (tile_offsets, slot_ranges, gaussians, slots)
     settings = _settings(size, thresholds)
     given = splats, colors, background, entries, settings, (*image, None), 0
-    call_core(colors, "rasterize_forward", *given, _boundaries(samples, patches, radius))
+    call_core(colors, "rasterize_forward", *given, *_boundaries(samples, patches, radius))
     return image
 
 
-def _boundaries(samples: Tensor | None, patches: list[Tensor], radius: float) -> object:
-    if samples is None:
-        return None
-    return *patches, samples, radius
+def _boundaries(samples: Tensor | None, patches: list[Tensor], radius: float) -> list[object]:
+    return [] if samples is None else [(*patches, samples, radius)]
 
 
 def _blend_backward(x: Backward) -> Sequence[Tensor | None]:
@@ -213,9 +211,9 @@ def _blend_backward(x: Backward) -> Sequence[Tensor | None]:
     settings = _settings(size, thresholds)
     images = by_color, by_transmittance, transmittance, stop
     by_samples = None if samples is None else empty_like(samples)
-    bounds = _boundaries(samples, patches, radius), by_samples
-    results = (*out, by_probe), absgrad, *bounds
-    call_core(colors, "rasterize_backward", *given, settings, images, *results)
+    results = (*out, by_probe), absgrad, *_boundaries(samples, patches, radius)
+    more = [] if by_samples is None else [by_samples]
+    call_core(colors, "rasterize_backward", *given, settings, images, *results, *more)
     by_background = None
     if x.needs[4]:
         by_background = torch.einsum("vhw,vhwd->vd", transmittance, by_color)
@@ -245,7 +243,7 @@ def _tally(
     image = *_image(colors, size), sums
     settings = _settings(size, thresholds)
     given = _arrays(*splats), colors, background, tuple(entries), settings, image, kind
-    call_core(colors, "rasterize_forward", *given, None)
+    call_core(colors, "rasterize_forward", *given)
     return sums, image[0], image[1]
 
 
