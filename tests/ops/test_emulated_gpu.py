@@ -119,3 +119,8 @@ def test_arrays_of_the_wrong_size_are_refused(gpu: Callable) -> None:
             native.array(torch.zeros(2, dtype=torch.int32)),
             native.num_threads(),
         )
+
+
+def test_boundary_weights_are_refused(gpu: Callable) -> None:
+    with gpu(), pytest.raises(DyngsError, match="boundary weights run on the CPU only"):
+        computed("boundaries")
