@@ -165,6 +165,109 @@ void test_moving_colours() {
   expect(inner > 50, std::to_string(inner) + " have neighbours");
 }
 
+// One splat per covered pixel, blended with weights near outlines.
+struct BoundedCase {
+  int width, height;
+  int64_t n;
+  std::vector<int32_t> rows, ids, radii;
+  Values means, factors, opacities, depths, colors, samples, g_color, g_transmittance;
+};
+
+BoundedCase bounded_case(int width, int height) {
+  BoundedCase c{width, height, 0, {}, {}, {}, {}, {}, {}, {}, {}, {}, {}, {}};
+  for (int i = 0; i < width * height; ++i) {
+    const double x = i % width + 0.5, y = i / width + 0.5;
+    const int patch = static_cast<int>(x / 7 + y / 9) % 4 - 1;
+    c.rows.push_back(patch < 0 ? -1 : static_cast<int32_t>(c.n++));
+    if (patch < 0) continue;
+    c.ids.push_back(patch);
+    for (const double at : {x, y}) {
+      c.means.push_back(at + uniform(-0.3, 0.3));
+      c.samples.push_back(at + uniform(0.15, 0.45));
+    }
+  }
+  c.radii.assign(2 * c.n, 9);
+  for (int64_t i = 0; i < c.n; ++i)
+    for (const double factor : {0.6, 0.1, 0.8}) c.factors.push_back(factor * uniform(0.8, 1.2));
+  c.opacities = uniforms(c.n, 0.2, 0.7), c.depths = uniforms(c.n, 1, 2), c.colors = uniforms(3 * c.n, 0, 1);
+  c.g_color = uniforms(int64_t{3} * width * height, -1, 1);
+  c.g_transmittance = uniforms(int64_t{width} * height, -1, 1);
+  return c;
+}
+
+template <class S>
+struct Bounded {
+  std::vector<S> color, transmittance, g_means, g_factors, g_opacities, g_colors, g_samples;
+};
+
+template <class S>
+Bounded<S> bounded_on_cpu(const BoundedCase& c, int threads = 1) {
+  const auto means = as<S>(c.means), factors = as<S>(c.factors), opacities = as<S>(c.opacities);
+  const auto depths = as<S>(c.depths), colors = as<S>(c.colors), samples = as<S>(c.samples);
+  const auto g_color = as<S>(c.g_color), g_transmittance = as<S>(c.g_transmittance);
+  const Splats<S> splats{c.n,
+                         1,
+                         c.width,
+                         c.height,
+                         3,
+                         means.data(),
+                         factors.data(),
+                         opacities.data(),
+                         depths.data(),
+                         colors.data(),
+                         c.radii.data(),
+                         S(0),
+                         S(0.99),
+                         S(0),
+                         threads};
+  const Boundaries<S> boundaries{c.rows.data(), c.ids.data(), samples.data(), S(2)};
+  const Binning bins = bin_tiles(splats, std::numeric_limits<int32_t>::max());
+  const Entries entries{bins.tile_offsets.data(), bins.slot_ranges.data(), bins.gaussians.data(), bins.slots.data(),
+                        static_cast<int64_t>(bins.gaussians.size())};
+  const int64_t pixels = int64_t{c.width} * c.height;
+  std::vector<int32_t> stop(pixels);
+  Bounded<S> out;
+  out.color.resize(3 * pixels), out.transmittance.resize(pixels);
+  rasterize_bounded_forward(
+      splats, entries, boundaries,
+      Image<S>{out.color.data(), out.transmittance.data(), stop.data(), nullptr, nullptr, Tally::kNone});
+  out.g_means.resize(2 * c.n), out.g_factors.resize(3 * c.n), out.g_opacities.resize(c.n);
+  out.g_colors.resize(3 * c.n), out.g_samples.resize(2 * c.n);
+  rasterize_bounded_backward(
+      splats, entries, boundaries,
+      ImageGrads<S>{g_color.data(), g_transmittance.data(), out.transmittance.data(), stop.data(), nullptr},
+      SplatGrads<S>{out.g_means.data(), out.g_factors.data(), out.g_opacities.data(), out.g_colors.data(), nullptr,
+                    false},
+      out.g_samples.data());
+  return out;
+}
+
+void test_bounded() {
+  const BoundedCase c = bounded_case(35, 27);
+  const Bounded<double> d = bounded_on_cpu<double>(c);
+  const auto total = [&](Values BoundedCase::* member) {
+    return [&c, member](const Values& x) {
+      BoundedCase moved = c;
+      moved.*member = x;
+      const Bounded<double> drawn = bounded_on_cpu<double>(moved);
+      return dot(drawn.color, c.g_color) + dot(drawn.transmittance, c.g_transmittance);
+    };
+  };
+  expect_gradient("slopes of samples", total(&BoundedCase::samples), c.samples, d.g_samples, 1e-6, 1e-6, 60);
+  expect_gradient("slopes of bounded means", total(&BoundedCase::means), c.means, d.g_means, 1e-6, 1e-6, 20);
+  expect_gradient("slopes of bounded opacities", total(&BoundedCase::opacities), c.opacities, d.g_opacities, 1e-6, 1e-6,
+                  20);
+  const Bounded<float> f = bounded_on_cpu<float>(c);
+  expect_close("float bounded image", f.color, d.color, 1e-5);
+  expect_close("float slopes of samples", f.g_samples, d.g_samples, 1e-3);
+  for (const int threads : {2, 5}) {
+    const Bounded<float> other = bounded_on_cpu<float>(c, threads);
+    expect_same_bits("bounded image on threads", other.color, f.color);
+    expect_same_bits("slopes of samples on threads", other.g_samples, f.g_samples);
+    expect_same_bits("slopes of bounded means on threads", other.g_means, f.g_means);
+  }
+}
+
 }  // namespace
 
 int main() {
@@ -172,5 +275,6 @@ int main() {
   for (const int basis : {0, -1, -2, 1, 3}) test_values(basis, 3);
   test_values(0, 1), test_visible_points(), test_degenerate_patches(), test_known_outline(), test_outlines();
   test_blending(1), test_blending(4), test_moving_colours();
+  test_bounded();
   return report();
 }
