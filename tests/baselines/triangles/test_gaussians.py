@@ -14,6 +14,7 @@ from small_triangles import bent, camera, config_of, triangle
 from torch import Tensor
 
 from dyngs.api.train import train
+from dyngs.baselines.triangles.kind import BgTriangleModel
 from dyngs.baselines.triangles.scene import (
     BOUNDARY_RADIUS,
     FIRST_SCALE,
@@ -22,6 +23,7 @@ from dyngs.baselines.triangles.scene import (
     Patches,
     TriangleOptions,
     TriangleScene,
+    restore_scene,
 )
 from dyngs.cli import main
 from dyngs.core.metrics import psnr
@@ -31,7 +33,7 @@ from dyngs.ops.native import kernel_threads
 from dyngs.ops.patches import lattice, patch_values
 from dyngs.ops.projection import ProjectionOptions
 from dyngs.ops.rasterization import Boundaries
-from dyngs.runs.checkpoint import checkpoint_paths
+from dyngs.runs.checkpoint import checkpoint_paths, latest_checkpoint
 from dyngs.runs.opened import open_run
 
 KEYS = ["model.primitives=gaussians", "train.steps=112", "train.save_every=56"]
@@ -204,3 +206,16 @@ def test_mismatched_shapes_are_refused() -> None:
     assert Patches.from_state(stored).quats is not None
     with pytest.raises(ValueError, match="'quats'"):
         Patches.from_state(stored | {"quats": torch.zeros(4, 6, 3)})
+
+
+def test_checkpoints_without_gaussians_open(run: Path) -> None:
+    """As those of runs from before Gaussians."""
+    checkpoint = latest_checkpoint(run)
+    assert checkpoint is not None
+    new = {f"triangles.{name}" for name in ("log_scales", "quats", "scale")}
+    assert new <= set(checkpoint.tensors)
+    tensors = {name: x for name, x in checkpoint.tensors.items() if name not in new}
+    opened = restore_scene(BgTriangleModel(), replace(checkpoint, tensors=tensors))
+    assert opened.options.primitives == "faces"
+    assert opened.patches.log_scales is None
+    assert set(opened.patches.tensors) == {"points", "colours", "harmonics"}
