@@ -37,7 +37,7 @@ _OF_A_TEMPLATE = {
     ),
     "uv": ("FILE", ".obj with the texture coordinates of --template if it has none"),
 }
-VERBS = ("inspect", "sfm", "fit", "people", "motion", "synth")
+VERBS = ("inspect", "sfm", "fit", "people", "motion", "synth", "scans")
 
 
 def add_parser(commands: args.Commands) -> None:
@@ -53,6 +53,7 @@ def add_parser(commands: args.Commands) -> None:
     _add_people(verbs)
     _add_motion(verbs)
     _add_synth(verbs)
+    _add_scans(verbs)
 
 
 def _add_inspect(verbs: args.Commands) -> None:
@@ -200,6 +201,28 @@ def _add_synth(verbs: args.Commands) -> None:
     parser.add_argument(
         "--seed", type=args.integer_type("a seed", 0, 10**9), metavar="N", help=seed
     )
+
+
+def _add_scans(verbs: args.Commands) -> None:
+    parser = args.add_command(
+        verbs,
+        "scans",
+        run_scans,
+        "render textured scans of people as captures",
+        "Render .obj and .glb files, such as those of THuman2.0 and RenderPeople, from a ring of "
+        "cameras: one capture per person with silhouettes and depth maps, for `dyngs train gps`. "
+        "Scans are y up; people are scaled to 1.8 m.",
+    )
+    about = "folder that holds the scans, in any subfolders"
+    parser.add_argument("folder", type=args.input_path, metavar="FOLDER", help=about)
+    parser.add_argument("out", type=args.output_path, metavar="OUT", help="a new folder")
+    kind = args.integer_type("a number", 0, 10**6)
+    for name, default, about in (
+        ("size", 256, "width and height of the images in pixels (default 256)"),
+        ("cameras", 24, "cameras on the ring (default 24)"),
+        ("seed", 0, "random seed of the rings (default 0)"),
+    ):
+        parser.add_argument(f"--{name}", type=kind, default=default, metavar="N", help=about)
 
 
 def run_inspect(arguments: argparse.Namespace) -> int:
@@ -397,4 +420,18 @@ def run_synth(arguments: argparse.Namespace) -> int:
             usual = "fixed" if "num_cameras" in given else None
             synthetic.write_dynamic_capture(scene, out, options(**{"style": usual} | given))
     print(f"written: {out}\nnext:    dyngs train {preset} {quote_path(out)}")
+    return 0
+
+
+def run_scans(arguments: argparse.Namespace) -> int:
+    """Write the captures and print the command that trains on them."""
+    from dyngs.human.synthetic.capture import PeopleOptions
+    from dyngs.human.synthetic.scans import write_scans
+
+    out: Path = arguments.out
+    options = PeopleOptions(size=arguments.size, cameras=arguments.cameras, seed=arguments.seed)
+    with ProgressBar() as report:
+        count = write_scans(arguments.folder, out, options, report)
+    print(f"written: {out}, {format_count(count, 'capture')}")
+    print(f"next:    dyngs train gps {quote_path(out)}")
     return 0

@@ -496,7 +496,8 @@ def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Pa
         raise DyngsError("a synthetic person needs size, frames and cameras >= 1 and seed >= 0")
     body, betas = _person(options.body_seed)
     outfit, clothed, texture = _dressed(body, options.seed, options.everyday_clothes)
-    train, test = _cameras(options)
+    train, test = ring_cameras(options)
+    light = random_light(options.scene_seed)
     clips = {"train": (options.num_frames, {"train": train, "test": test})}
     if options.num_pose_frames and test:
         clips["pose"] = options.num_pose_frames, {"pose": test}
@@ -508,7 +509,7 @@ def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Pa
             )
             meshes = _posed_meshes(clothed, motion, texture)
             for split, cameras in splits.items():
-                _write_split(started, split, meshes, cameras, options)
+                write_split(started, split, meshes, cameras, options, light)
             layout = "smpl" if options.body_seed is None else "anny"
             write_amass(motion, started / f"body_{name}.npz", layout)
     return out
@@ -602,15 +603,20 @@ def _image_of(points: np.ndarray, world_from_cam: np.ndarray, size: int) -> np.n
     )
 
 
-def _write_split(
+def write_split(
     out: Path,
     split: str,
     meshes: list[PosedMesh],
     cameras: dict[int, np.ndarray],
     options: HumanOptions,
+    light: DirectionalLight,
 ) -> None:
+    """Write the images, depth maps and cameras of a split, with a mesh per frame; nothing without
+    views.
+
+    ``cameras`` are OpenGL poses (4, 4) by number.
+    """
     entries = []
-    light = random_light(options.scene_seed)
     size = options.size
     for i, mesh in enumerate(meshes):
         for camera, pose in cameras.items():
@@ -655,7 +661,7 @@ def _posed_meshes(body: BodyTemplate, motion: Motion, texture: np.ndarray) -> li
     return [PosedMesh(vertices, faces, uv, uv_faces, texture) for vertices in posed]
 
 
-def _cameras(options: HumanOptions) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray]]:
+def ring_cameras(options: HumanOptions) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray]]:
     """Return the OpenGL poses (4, 4) of training and test cameras by number, on a ring."""
     count = options.num_cameras
     num_test = options.num_test
@@ -704,10 +710,11 @@ def _shaded(mesh: PosedMesh, fragments: Fragments, light: DirectionalLight) -> n
 
 
 def _sampled(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """Sample a texture (S, S, 3) at ``uv`` (H, 2), bilinear; return (H, 3)."""
+    """Sample a texture (S, S, 3) at ``uv`` (H, 2), bilinear, repeated beyond [0, 1]; return (H,
+    3)."""
     places = texel_coordinates(uv, len(texture))[::-1]
     channels = [
-        map_coordinates(x, places, order=1, mode="nearest") for x in np.moveaxis(texture, 2, 0)
+        map_coordinates(x, places, order=1, mode="grid-wrap") for x in np.moveaxis(texture, 2, 0)
     ]
     return np.stack(channels, axis=-1)
 
@@ -738,6 +745,18 @@ def write_people(
     options, missing ones are added, so that a set can be written in parts and used meanwhile.
     Raises DyngsError: options out of range, or a folder with other contents.
     """
+    open_people_set(out, options)
+    for number in range(options.people):
+        person = out / f"s{number // PEOPLE_PER_FOLDER:04d}" / f"p{number:06d}"
+        if not person.is_dir():
+            write_human_capture(person, person_options(options, number))
+        report("people", number + 1, options.people)
+    return out
+
+
+def open_people_set(out: Path, options: PeopleOptions) -> None:
+    """Mark a new folder as a set of people of these options. Raises DyngsError: options out of
+    range, or a folder with other contents."""
     least = min(options.people, options.size, options.cameras, options.frames, options.seed + 1)
     if least < 1 or options.people > _MAX_PEOPLE:
         raise DyngsError(
@@ -755,12 +774,6 @@ def write_people(
             f"{out}: holds people with other options ({PEOPLE_FILE}); use a new folder or the "
             "same options"
         )
-    for number in range(options.people):
-        person = out / f"s{number // PEOPLE_PER_FOLDER:04d}" / f"p{number:06d}"
-        if not person.is_dir():
-            write_human_capture(person, person_options(options, number))
-        report("people", number + 1, options.people)
-    return out
 
 
 def person_options(options: PeopleOptions, number: int) -> HumanOptions:
