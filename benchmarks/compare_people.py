@@ -1,6 +1,7 @@
 """Networks that predict people, given the same few views of people that they were not trained on.
 
-    python benchmarks/compare_people.py PEOPLE NETWORK... --counts 2 3 4 [--spread] [--minutes M] --out FOLDER
+    python benchmarks/compare_people.py PEOPLE NETWORK... --counts 2 3 4 [--spread] [--starts N]
+                                        [--minutes M] --out FOLDER
 
 ``--minutes``: an avatar is trained on the same images alone for so long, too. Times are CPU seconds
 of one thread. Writes the scores as .csv, the table as .md and pictures of truth, prediction and
@@ -15,7 +16,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 from statistics import fmean, median
 
@@ -66,6 +67,7 @@ class PeopleBench:
         avatar_minutes: a `human` avatar is trained on the same images alone for so long; None: none
             is.
         data: overrides of the section ``data``, as "longest_side=256".
+        starts: places of the ring that the views of each person start from, one after the other.
     """
 
     people: Path
@@ -74,6 +76,7 @@ class PeopleBench:
     spread: bool = False
     avatar_minutes: float | None = None
     data: Sequence[str] = ()
+    starts: int = 1
 
 
 @dataclass(frozen=True)
@@ -132,8 +135,9 @@ def compare_people(bench: PeopleBench, out: Path) -> Table:
                 tests = read_capture(data).splits.get("test", ())
                 for label, method in methods.items():
                     try:
-                        for count in bench.counts:
-                            sources, targets = task_of(views, tests, count, number, bench.spread)
+                        for count, start in product(bench.counts, range(bench.starts)):
+                            first = number + start
+                            sources, targets = task_of(views, tests, count, first, bench.spread)
                             if targets:
                                 images = ImageLoader(tuple(targets), data)
                                 made = method(sources)
@@ -290,13 +294,20 @@ def main() -> None:
     parser.add_argument("networks", type=Path, nargs="+")
     parser.add_argument("--counts", type=int, nargs="+", default=[2, 3, 4])
     parser.add_argument("--spread", action="store_true")
+    parser.add_argument("--starts", type=int, default=1)
     parser.add_argument("--minutes", type=float)
     parser.add_argument("--data", nargs="*", default=[], metavar="KEY=VALUE")
     parser.add_argument("--out", type=Path, required=True)
     given = parser.parse_args()
     print_messages()
     bench = PeopleBench(
-        given.people, given.networks, given.counts, given.spread, given.minutes, given.data
+        given.people,
+        given.networks,
+        given.counts,
+        given.spread,
+        given.minutes,
+        given.data,
+        given.starts,
     )
     with kernel_threads(1):
         table = compare_people(bench, given.out)
