@@ -20,6 +20,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import fmean
+from typing import Any
 
 import torch
 from compare_people import PeopleBench, compare_people
@@ -82,8 +83,9 @@ def config_of(people: Path, out: Path, variant: str, seed: int, words: Sequence[
 def seconds_per_step(config: Config) -> float:
     """Return the mean time of a step over both stages, weighted as in training."""
     steps = 4 * PILOT_STEPS
-    fraction = config.model.depth_fraction
-    model = config.model.model_copy(update={"depth_fraction": 0.5})
+    section: Any = config.model
+    fraction = section.depth_fraction
+    model = section.model_copy(update={"depth_fraction": 0.5})
     pilot = config.model_copy(
         update={"model": model, "train": config.train.model_copy(update={"steps": steps})}
     )
@@ -118,7 +120,8 @@ def trained_run(config: Config, minutes: float) -> Path:
 def offset_scores(run: Path, variant: str, seed: int, people: Path) -> list[OffsetScore]:
     """Return the errors of a network on ``people``, which have depth maps."""
     config, checkpoint = read_trained_network(run)
-    network = GpsNetwork(torch.Generator(), config.model)
+    section: Any = config.model
+    network = GpsNetwork(torch.Generator(), section)
     load_weights(network, checkpoint)
     recurrent = network.stereo if isinstance(network.stereo, RecurrentNetwork) else None
     scores = []
@@ -133,7 +136,7 @@ def offset_scores(run: Path, variant: str, seed: int, people: Path) -> list[Offs
             images = ImageLoader(views, data, with_maps=True)
             pairs = training_pairs(views)
             for left, right in (pair for pair, _ in pairs[:: -(-len(pairs) // PAIRS_PER_PERSON)]):
-                rectified = rectify_views(images[left], images[right], config.model.person_px)
+                rectified = rectify_views(images[left], images[right], section.person_px)
                 start = time.process_time()
                 offsets = network(rectified, with_gaussians=False)[0][-1]
                 times.append(time.process_time() - start)

@@ -15,6 +15,8 @@ import trimesh
 from PIL import Image
 from refused import error_line
 from tiny_stereo import stereo_config
+from trimesh.visual.material import SimpleMaterial
+from trimesh.visual.texture import TextureVisuals
 
 from dyngs.cli import main
 from dyngs.config import DataConfig
@@ -55,8 +57,7 @@ def files(person: PosedMesh, tmp_path_factory: pytest.TempPathFactory) -> Path:
     owner = np.zeros(len(person.uv), dtype=np.int64)
     owner[person.uv_faces.ravel()] = person.faces.ravel()
     image = Image.fromarray(np.round(255 * person.texture).astype(np.uint8))
-    material = trimesh.visual.material.SimpleMaterial(image=image)
-    visual = trimesh.visual.TextureVisuals(person.uv, material)
+    visual = TextureVisuals(person.uv, SimpleMaterial(image=image))
     mesh = trimesh.Trimesh(person.vertices[owner], person.uv_faces, visual=visual, process=False)
     mesh.export(out / "0042.obj")
     mesh.export(out / "0042.glb")
@@ -104,7 +105,8 @@ def test_images_and_depth_are_those_of_the_body(
     (data,) = list_captures(DataConfig(root=tmp_path / "out", test_every=0))
     views = read_capture(data).splits["train"]
     assert len(views) == 2
-    low, high = person.vertices.min(0), person.vertices.max(0)
+    low = person.vertices.min(0)
+    high = person.vertices.max(0)
     foot = np.array([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2])
     truth = replace(person, vertices=1.8 * (person.vertices - foot) / (high[1] - low[1]))
     light = DirectionalLight(ambient=(1.0,), diffuse=(0.0,))
