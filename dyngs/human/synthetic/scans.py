@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import product
 from pathlib import Path
 from typing import Any
 from zlib import crc32
@@ -27,7 +26,6 @@ _HEIGHT = 1.8  # to which people are scaled, m (Zheng et al. 2024)
 _MAX_TEXTURE = 2048  # px per side
 _MAX_ASPECT = 2.0  # largest width of a person relative to the height
 _LIGHT_IN_TEXTURE = DirectionalLight(ambient=(1.0,), diffuse=(0.0,))
-_TEXTURE_PLACES = tuple(product(("*_dif*", "*"), ("", "tex/")))  # names and folders, best first
 
 
 def write_scans(
@@ -56,7 +54,7 @@ def write_scans(
         person = out / "scans" / name
         if not person.is_dir():
             mesh = read_scan(path)
-            # A scan has the same cameras in any folder.
+            # The cameras of a scan do not depend on other scans.
             ring = person_options(options, crc32(name.encode()))
             with atomic_folder(person) as started:
                 write_split(
@@ -104,8 +102,8 @@ def _texture(path: Path, material: Any) -> np.ndarray:
 
 def _image_beside(path: Path) -> Path:
     """Return the only diffuse or only other image in the folder of a scan, or in its ``tex``."""
-    for pattern, folder in _TEXTURE_PLACES:
-        files = path.parent.glob(folder + pattern)
+    for pattern in ("*_dif*", "tex/*_dif*", "*", "tex/*"):
+        files = path.parent.glob(pattern)
         images = [file for file in files if file.suffix.lower() in PHOTO_SUFFIXES]
         if len(images) == 1:
             return images[0]
