@@ -234,7 +234,7 @@ def correlation_pyramid(features: Tensor) -> list[Tensor]:
     levels = []
     for _ in range(LEVELS):
         levels.append(torch.einsum("vchx,vchy->vhxy", scaled, others))
-        # The last one of an odd number of columns is kept. Means of features give means of products.
+        # Products with mean features are mean products. An odd last column is kept.
         others = avg_pool2d(others, (1, 2), ceil_mode=True)
     return levels
 
