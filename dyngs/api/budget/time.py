@@ -1,7 +1,8 @@
 """``train.minutes``: number of steps that fit into a time limit.
 
-Steps are timed before training, and the number is corrected during the run, since the cost of
-motion and of images at full size is known late. ``dyngs.training.clock`` forecasts the cost of later steps.
+Steps are timed before training. The number is corrected during the run, since the cost of motion
+and of images at full size is known late. ``dyngs.training.clock`` forecasts the cost of later
+steps.
 """
 
 from __future__ import annotations
