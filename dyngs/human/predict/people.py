@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from scipy.spatial import KDTree
 from torch import Tensor
+from torch.nn.functional import grid_sample
 
 from dyngs.config import DataConfig
 from dyngs.core.camera import Cameras
@@ -22,10 +23,11 @@ from dyngs.data.read import read_capture
 from dyngs.human.avatar.posing import BodyPose, frame_pose
 from dyngs.human.body.body import BodyTemplate
 from dyngs.human.body.body_reader import rest_shape
-from dyngs.human.body.mesh import rasterize, vertex_normals
+from dyngs.human.body.mesh import vertex_normals
 from dyngs.human.body.skinning import apply_transforms, blend_transforms, joint_transforms
 from dyngs.human.motion.motion import CapturedMotion, captured_motion
 from dyngs.human.predict.gps.rectification import crop_image, crop_to_person
+from dyngs.ops.patches import visible_patches
 
 NUM_KEY_POINTS = 22
 """Body joints that SMPL, SMPL-H and SMPL-X have in common."""
@@ -181,24 +183,42 @@ def crop_window(image: Image, left: int, top: int, side: int) -> Image:
 
 DILATION, EROSION = 0.06, 0.04  # distances of the boundary meshes from the body, m
 _NEAREST = 0.05  # near plane of depth maps, m
+_CELL = 0.02  # of the grid of heights, m
 
 
 class BodyBoundaries:
     """Body mesh with a dilated and an eroded copy, which bound the clothed surface."""
 
     def __init__(self, body: PosedBody) -> None:
-        self._faces = body.faces.cpu().numpy()
-        self._body = body.vertices.cpu().numpy().astype(np.float64)
-        self._normals = vertex_normals(self._body, self._faces)
-        self._tree = KDTree(self._body)
+        self._faces = body.faces
+        self._body = body.vertices
+        vertices = self._body.cpu().numpy().astype(np.float64)
+        normals = vertex_normals(vertices, self._faces.cpu().numpy())
+        self._normals = torch.from_numpy(normals).to(self._body)
+        # Heights at the centres of a grid of cells, whose values end at ``reach``.
+        reach = DILATION + _CELL
+        low = vertices.min(axis=0) - reach
+        cells = np.ceil((vertices.max(axis=0) + reach - low) / _CELL).astype(int)
+        axes = [low[i] + (np.arange(cells[i]) + 0.5) * _CELL for i in range(3)]
+        centres = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+        distance, nearest = KDTree(vertices).query(centres, distance_upper_bound=reach)
+        nearest = np.minimum(nearest, len(vertices) - 1)
+        is_inside = ((centres - vertices[nearest]) * normals[nearest]).sum(-1) < 0
+        height = np.minimum(distance, reach) * np.where(is_inside & (distance < reach), -1, 1)
+        self._heights = torch.from_numpy(height).to(self._body)[None, None]
+        self._low = torch.from_numpy(low).to(self._body)
+        self._size = torch.from_numpy(_CELL * cells).to(self._body)
 
     def height(self, points: Tensor) -> Tensor:
         """Return the signed distance (N,) of points (N, 3) to the nearest vertex, m; negative
-        inside."""
-        positions = points.detach().cpu().double().numpy()
-        distance, nearest = (np.asarray(x) for x in self._tree.query(positions))
-        is_inside = ((positions - self._body[nearest]) * self._normals[nearest]).sum(1) < 0
-        return torch.from_numpy(np.where(is_inside, -distance, distance)).to(points)
+        inside.
+
+        Interpolated in a grid of 2 cm cells, and at most 8 cm.
+        """
+        at = 2 * (points - self._low) / self._size - 1
+        at = at.flip(-1)[None, None, None]  # the last axis of the grid comes first
+        found = grid_sample(self._heights, at, padding_mode="border", align_corners=False)
+        return found.flatten()
 
     def depth(self, camera: Cameras) -> Tensor:
         """Return the depth map (H, W) of the body, m; infinite in the background."""
@@ -223,9 +243,10 @@ class BodyBoundaries:
         return entry, torch.maximum(end, entry), body_depth
 
 
+@torch.no_grad()
 def depths(
-    vertices: np.ndarray,
-    faces: np.ndarray,
+    vertices: Tensor,
+    faces: Tensor,
     camera: Cameras,
     *,
     last: bool = False,
@@ -240,22 +261,22 @@ def depths(
         last: return the last intersection instead of the first.
         front_faces: ignore back faces.
     """
-    pose, k = (x[0].double().cpu().numpy() for x in (camera.cam_from_world, camera.intrinsics))
+    pose = camera.cam_from_world[0].to(vertices)
     local = vertices @ pose[:3, :3].T + pose[:3, 3]
-    inverse = 1 / np.maximum(local[:, 2], _NEAREST)
-    pixels = (local @ k.T)[:, :2] * inverse[:, None] - 0.5
-    most = 1.01 / _NEAREST
-    corners = np.concatenate([pixels, (most - inverse if last else inverse)[:, None]], axis=1)
-    corners = corners[faces]
-    hidden = (local[faces, 2] <= _NEAREST).any(axis=1)
+    corners = local[faces]
+    shown = (corners[..., 2] > _NEAREST).all(1)
+    a, b, c = corners.unbind(1)
     if front_faces:
-        (x0, x1, x2), (y0, y1, y2) = corners[..., 0].T, corners[..., 1].T
-        hidden |= (x1 - x0) * (y2 - y0) - (y1 - y0) * (x2 - x0) >= 0  # rows go down
-    corners = corners[~hidden]
-    fragments = rasterize(corners, camera.width, camera.height)
-    # Inverse depth is linear in the image.
-    nearness = 1 / (fragments.barycentric / corners[fragments.faces, :, 2]).sum(axis=1)
-    image = np.full(camera.height * camera.width, np.inf)
-    image[fragments.index] = 1 / (most - nearness if last else nearness)
-    shape = camera.height, camera.width
-    return torch.from_numpy(image.reshape(shape)).to(camera.intrinsics)
+        shown &= (a * torch.linalg.cross(b, c)).sum(-1) < 0
+    if last:
+        # A projective map that keeps pixels and planes and reverses the order of depths.
+        farthest = 1 / _NEAREST + 1
+        a, b, c = (x / (farthest * x[:, 2:] - 1) for x in (a, b, c))
+    patches = torch.stack([a, (a + b) / 2, (a + c) / 2, b, (b + c) / 2, c], 1)[shown]
+    own = replace(camera, cam_from_world=torch.eye(4).to(pose)[None])
+    ids, uv = visible_patches(patches, own, 1e-3, segments=1)
+    weights = torch.cat([uv, 1 - uv.sum(-1, keepdim=True)], -1)[0]
+    depth = (patches[ids[0].clamp_min(0).long()][..., [0, 3, 5], 2] * weights).sum(-1)
+    if last:
+        depth = depth / (farthest * depth - 1)
+    return torch.where(ids[0] >= 0, depth, torch.inf)

@@ -156,7 +156,7 @@ def sample_offsets(*shape: int, generator: torch.Generator | None) -> Tensor:
 
 
 NEAR = 0.1  # near plane, m
-CHUNK = 1 << 12  # rays rendered together without gradients
+CHUNK = 1 << 10  # rays rendered together without gradients
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ import torch
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import KDTree
 from torch import Tensor, nn
+from torch.nn.functional import max_pool2d, pad
 
 from dyngs.config import Config, DataConfig
 from dyngs.config.io import load_config, packaged_preset
@@ -204,7 +205,7 @@ def observe_texels(person: AtlasPerson, images: Iterable[tuple[Image, BodyPose]]
     """Collect the texel maps of one or more images, each with its body pose."""
     shape = (len(person.heights), len(person.texels))
     device = person.texels.points.device
-    faces = person.person.body.faces.cpu().numpy()
+    faces = person.person.body.faces
     colour = torch.zeros(*shape, 3, device=device)
     weight, seen, inside, in_frames = (torch.zeros(shape, device=device) for _ in range(4))
     silhouette_distance = torch.full(shape, MAX_SILHOUETTE_DISTANCE, device=device)
@@ -217,7 +218,9 @@ def observe_texels(person: AtlasPerson, images: Iterable[tuple[Image, BodyPose]]
         alpha = white if image.alpha is None else image.alpha
         planes = [image.rgb_premultiplied, alpha[..., None], _edge_distances(image)[..., None]]
         scaffolds = [_posed_vertices(person, pose, height) for height in person.heights]
-        normals = _at_texels(person, vertex_normals(scaffolds[0], faces))
+        vertices = scaffolds[0].double().cpu().numpy()
+        normals = torch.from_numpy(vertex_normals(vertices, faces.cpu().numpy())).float()
+        normals = _at_texels(person, normals.to(device))
         normals = torch.nn.functional.normalize(normals, dim=1)
         offsets.append(normals @ pose.rotations[0])
         for level, vertices in enumerate(scaffolds):
@@ -289,16 +292,17 @@ def _edge_distances(image: Image) -> Tensor:
     return torch.from_numpy(signed).to(image.rgb_premultiplied)
 
 
-def _nearest_depth(vertices: np.ndarray, faces: np.ndarray, camera: Cameras, at: Tensor) -> Tensor:
+def _nearest_depth(vertices: Tensor, faces: Tensor, camera: Cameras, at: Tensor) -> Tensor:
     """Return the smallest depth (P,) of a mesh in the four pixels around ``at`` (P, 2); infinite
     outside."""
-    depth = np.pad(depths(vertices, faces, camera).numpy(), 1, constant_values=np.inf)
-    least = np.minimum.reduce([depth[:-1, :-1], depth[1:, :-1], depth[:-1, 1:], depth[1:, 1:]])
+    depth = depths(vertices, faces, camera)
+    # The minimum of 2 x 2 pixels, infinite beyond the image.
+    least = -max_pool2d(-pad(depth, (1, 1, 1, 1), value=torch.inf)[None], 2, 1)[0]
     column, row = (
         (at[:, i] + 0.5).floor().nan_to_num().clamp(0, size).long()
         for i, size in enumerate((camera.width, camera.height))
     )
-    return torch.from_numpy(least)[row.cpu(), column.cpu()].to(at)
+    return least[row, column]
 
 
 def _sampled(image: Tensor, at: Tensor) -> Tensor:
@@ -312,18 +316,17 @@ def _sampled(image: Tensor, at: Tensor) -> Tensor:
     return sampled[0, :, 0].T
 
 
-def _at_texels(person: AtlasPerson, values: np.ndarray) -> Tensor:
+def _at_texels(person: AtlasPerson, values: Tensor) -> Tensor:
     """Interpolate vertex values (M, 3) at the texels; return (P, 3)."""
     corners = person.person.body.faces[person.texels.faces]
-    corner_values = torch.from_numpy(values).float().to(corners.device)[corners]
-    return (person.texels.barycentric[..., None] * corner_values).sum(1)
+    return (person.texels.barycentric[..., None] * values[corners]).sum(1)
 
 
-def _posed_vertices(person: AtlasPerson, pose: BodyPose, height: float) -> np.ndarray:
+def _posed_vertices(person: AtlasPerson, pose: BodyPose, height: float) -> Tensor:
     """Return the vertices (M, 3) of a scaffold in world coordinates."""
     vertices = person.person.body.vertices + height * person.normals
     posed, _ = person.person.posed(vertices, pose)
-    return (pose.scale * posed + pose.trans).cpu().numpy()
+    return pose.scale * posed + pose.trans
 
 
 WIDTHS = (24, 32, 48, 64)

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from dyngs.core.camera import Cameras
+from dyngs.human.body.mesh import rasterize
 from dyngs.human.predict.people import (
     DILATION,
     EROSION,
@@ -20,7 +21,7 @@ from dyngs.human.predict.people import (
 DISTANCE, RADIUS = 3.0, 0.3
 
 
-def sphere(radius: float) -> tuple[np.ndarray, np.ndarray]:
+def sphere(radius: float) -> tuple[torch.Tensor, torch.Tensor]:
     """Vertices and triangles, anticlockwise from outside, of a fine sphere."""
     rings, steps = 40, 80
     angles = (
@@ -39,7 +40,11 @@ def sphere(radius: float) -> tuple[np.ndarray, np.ndarray]:
     faces = np.concatenate(
         [np.stack([a, b, b + steps], -1), np.stack([a, b + steps, a + steps], -1)]
     )
-    return vertices, faces.reshape(-1, 3)
+    return torch.from_numpy(vertices).float(), torch.from_numpy(faces.reshape(-1, 3))
+
+
+def body(radius: float) -> PosedBody:
+    return PosedBody(torch.zeros(22, 3), *sphere(radius))
 
 
 def camera() -> Cameras:
@@ -73,17 +78,13 @@ def test_a_sphere_is_met_first_and_last(last: bool) -> None:
     assert float((found - expected)[both].abs().mean()) < 2e-3
     if not last:
         assert torch.equal(depths(vertices, faces, camera(), front_faces=True), found)
-    turned = depths(vertices, faces[:, ::-1], camera(), front_faces=True)
+    turned = depths(vertices, faces.flip(1), camera(), front_faces=True)
     middle = turned[12, 16]
     assert float(middle) == pytest.approx(DISTANCE + RADIUS, abs=2e-3), "seen from inside alone"
 
 
 def test_boundaries_of_a_ball_are_balls() -> None:
-    vertices, faces = sphere(RADIUS)
-    body = PosedBody(
-        torch.zeros(22, 3), torch.from_numpy(vertices).float(), torch.from_numpy(faces.copy())
-    )
-    begin, end, met = BodyBoundaries(body).interval(camera())
+    begin, end, met = BodyBoundaries(body(RADIUS)).interval(camera())
     middle = begin[12, 16], met[12, 16], end[12, 16]
     expected = (DISTANCE - RADIUS - DILATION, DISTANCE - RADIUS, DISTANCE - RADIUS + EROSION)
     torch.testing.assert_close(torch.stack(middle), torch.tensor(expected), atol=2e-3, rtol=0)
@@ -98,18 +99,49 @@ def test_boundaries_of_a_ball_are_balls() -> None:
 
 def test_a_thin_body_ends_behind_its_front() -> None:
     """Eroded by more than its radius it is inside out, and its back would come first."""
-    vertices, faces = sphere(0.03)
-    body = PosedBody(
-        torch.zeros(22, 3), torch.from_numpy(vertices).float(), torch.from_numpy(faces.copy())
-    )
-    _, end, met = BodyBoundaries(body).interval(camera())
+    _, end, met = BodyBoundaries(body(0.03)).interval(camera())
     assert float(end[12, 16]) > float(met[12, 16])
 
 
+def test_depths_are_those_of_the_mesh_renderer_in_numpy(person: Person) -> None:
+    """Of a body whose parts hide each other; in float64."""
+    own, scale = person.body_in(person.views[0])
+    view = cameras_in_metres(person.images[0].cameras, scale)
+    pose, k = (x[0].double().numpy() for x in (view.cam_from_world, view.intrinsics))
+    local = own.vertices.double().numpy() @ pose[:3, :3].T + pose[:3, 3]
+    inverse = 1 / local[:, 2]
+    pixels = (local @ k.T)[:, :2] * inverse[:, None] - 0.5
+    for last in (False, True):
+        nearness = np.stack([*pixels.T, 10 - inverse if last else inverse], 1)[own.faces.numpy()]
+        found = rasterize(nearness, view.width, view.height)
+        nearest = 1 / (found.barycentric / nearness[found.faces, :, 2]).sum(1)
+        expected = np.full(view.width * view.height, np.inf)
+        expected[found.index] = 1 / (10 - nearest if last else nearest)
+        ours = depths(own.vertices, own.faces, view, last=last).flatten()
+        torch.testing.assert_close(ours, torch.from_numpy(expected).float(), atol=2e-4, rtol=0)
+
+
+def test_heights_grow_steadily_through_the_surface() -> None:
+    """Distances to vertices alone, which lie apart, jump by twice their distance there."""
+    boundaries = BodyBoundaries(body(RADIUS))
+    directions = torch.nn.functional.normalize(
+        torch.randn(50, 3, generator=torch.Generator().manual_seed(0)), dim=1
+    )
+    heights = torch.linspace(-0.05, 0.05, 41)
+    points = (RADIUS + heights)[:, None, None] * directions
+    found = boundaries.height(points.flatten(0, 1)).view(41, 50)
+    assert float((found - heights[:, None]).abs().max()) < 0.012
+    steps = found.diff(dim=0)
+    assert float(steps.min()) > 0
+    assert float(steps.max()) < 0.005, "half a cell apart"
+    far = boundaries.height(torch.tensor([[0.0, 0, RADIUS + 0.3], [9, 9, 9]]))
+    torch.testing.assert_close(far, torch.full((2,), 0.08))
+
+
 def test_the_surface_of_a_dressed_person_lies_in_between(person: Person) -> None:
-    body, scale = person.body_in(person.views[0])
+    own, scale = person.body_in(person.views[0])
     image = person.images[0]
-    begin, end, met = BodyBoundaries(body).interval(cameras_in_metres(image.cameras, scale))
+    begin, end, met = BodyBoundaries(own).interval(cameras_in_metres(image.cameras, scale))
     assert image.depth is not None
     assert image.alpha is not None
     solid = (image.alpha > 0.99) & (image.depth > 0)
