@@ -92,11 +92,10 @@ REMOVED_MODEL_KEYS: dict[str, dict[str, object]] = {
     },
     "nerf": {"width": 128, "coarse": 32, "fine": 32, "rays": 256},  # sizes=cpu
     "gps": {"widths": [24, 40, 64]},
-    "keypoint_nerf": {"features": 32, "width": 64, "patch": 32, "step": 0.015},
+    "keypoint_nerf": {"features": 32, "width": 64, "step": 0.015},
     "eg_human_nerf": {
         "features": 32,
         "width": 64,
-        "patch": 32,
         "samples": 16,
         "srdf_weight": 0.2,
         "boundaries": True,

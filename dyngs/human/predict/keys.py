@@ -10,7 +10,36 @@ from pydantic import Field
 from dyngs.core.section import Fraction, ModelSection, Positive, SceneModel
 
 
-class FieldPredictorModel(ModelSection):
+class _FieldKeys(ModelSection):
+    """Keys that decide how a field of a person is rendered."""
+
+    supersampling: int = Field(
+        default=1,
+        ge=1,
+        le=4,
+        description="rays per pixel and axis; 2 renders soft outlines at four times the cost",
+    )
+
+
+class EgHumanNerfKeys(_FieldKeys):
+    """Keys that decide how an EG-HumanNeRF field is rendered."""
+
+    density: Literal["neus", "laplace"] = Field(
+        default="neus",
+        description="eg_human_nerf: opacity from signed ray distances; neus: differences of a "
+        "sigmoid, laplace: density from the Laplace distribution function",
+    )
+    hidden_views: Literal["excluded", "weighted"] = Field(
+        default="excluded",
+        description="eg_human_nerf: images in which the body hides a sample; excluded: not used "
+        "where others show it, weighted: the attention weights them by the depth behind the body",
+    )
+    refine: bool = Field(
+        default=True, description="eg_human_nerf: a U-Net corrects the rendered image"
+    )
+
+
+class FieldPredictorModel(_FieldKeys):
     """Keys of networks that predict a radiance field of a person."""
 
     body: Path | None = Field(
@@ -21,6 +50,17 @@ class FieldPredictorModel(ModelSection):
         ge=2,
         le=16,
         description="input images per person; training examples have 2 to this number",
+    )
+    training_views: Literal["any", "between"] = Field(
+        default="any",
+        description="training examples; any: random or evenly spread input images and any other "
+        "image, between: two input images at most 50 degrees apart and one between them",
+    )
+    patch: int = Field(
+        default=32,
+        ge=8,
+        le=1024,
+        description="side of the image patch of a training step, px; KeypointNeRF: 64",
     )
     lr: Positive = Field(
         default=2e-3, description="peak learning rate of AdamW (one-cycle schedule)"
@@ -37,7 +77,7 @@ class KeypointNerfModel(FieldPredictorModel):
     )
 
 
-class EgHumanNerfModel(FieldPredictorModel):
+class EgHumanNerfModel(FieldPredictorModel, EgHumanNerfKeys):
     """EG-HumanNeRF (Wang, Kanamori and Endo 2024)."""
 
     kind: Literal["eg_human_nerf"] = Field(
@@ -47,7 +87,7 @@ class EgHumanNerfModel(FieldPredictorModel):
     )
 
 
-class PredictedFieldModel(ModelSection):
+class PredictedFieldModel(EgHumanNerfKeys):
     """Radiance field predicted by such a network; it is rendered but not trained."""
 
     kind: Literal["predicted_field"] = Field(

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -17,6 +18,7 @@ from torch.nn.functional import grid_sample
 from dyngs.config import DataConfig
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
+from dyngs.core.state import move_fields_to
 from dyngs.data.capture import Capture, View
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import read_capture
@@ -27,6 +29,7 @@ from dyngs.human.body.mesh import vertex_normals
 from dyngs.human.body.skinning import apply_transforms, blend_transforms, joint_transforms
 from dyngs.human.motion.motion import CapturedMotion, captured_motion
 from dyngs.human.predict.gps.rectification import crop_image, crop_to_person
+from dyngs.ops.device import CPU
 from dyngs.ops.patches import visible_patches
 
 NUM_KEY_POINTS = 22
@@ -42,6 +45,11 @@ class PosedBody:
     key_points: Tensor  # (J, 3)
     vertices: Tensor  # (M, 3)
     faces: Tensor  # (T, 3) int64
+
+    @cached_property
+    def boundaries(self) -> BodyBoundaries:
+        """Boundaries of the clothed surface, made once."""
+        return BodyBoundaries(self)
 
 
 @dataclass(frozen=True)
@@ -77,7 +85,9 @@ class Person:
     body: BodyTemplate  # in the person's shape, without a shape space
     motion: CapturedMotion
     images: ImageLoader
-    _bodies: dict[int | None, tuple[PosedBody, float]] = field(default_factory=dict)
+    _bodies: dict[tuple[int | None, torch.device], tuple[PosedBody, float]] = field(
+        default_factory=dict
+    )
 
     @property
     def views(self) -> tuple[View, ...]:
@@ -97,15 +107,16 @@ class Person:
         posed = apply_transforms(blend_transforms(body.weights, transforms), vertices)
         return posed, apply_transforms(transforms, body.joints)
 
-    def body_in(self, view: View) -> tuple[PosedBody, float]:
+    def body_in(self, view: View, device: torch.device = CPU) -> tuple[PosedBody, float]:
         """Return the body in the pose of ``view``, and the world units per metre; cached."""
-        if view.frame not in self._bodies:
+        key = view.frame, device
+        if key not in self._bodies:
             pose = self.pose_in(view)
             vertices, joints = self.posed(self.body.vertices, pose)
             shift = pose.trans / pose.scale
             body = PosedBody(joints[:NUM_KEY_POINTS] + shift, vertices + shift, self.body.faces)
-            self._bodies[view.frame] = body, float(pose.scale)
-        return self._bodies[view.frame]
+            self._bodies[key] = move_fields_to(body, device), float(pose.scale)
+        return self._bodies[key]
 
 
 def captured_person(capture: Capture, template: BodyTemplate, images: ImageLoader) -> Person:
@@ -275,8 +286,11 @@ def depths(
     patches = torch.stack([a, (a + b) / 2, (a + c) / 2, b, (b + c) / 2, c], 1)[shown]
     own = replace(camera, cam_from_world=torch.eye(4).to(pose)[None])
     ids, uv = visible_patches(patches, own, 1e-3, segments=1)
-    weights = torch.cat([uv, 1 - uv.sum(-1, keepdim=True)], -1)[0]
-    depth = (patches[ids[0].clamp_min(0).long()][..., [0, 3, 5], 2] * weights).sum(-1)
+    meets = ids[0] >= 0
+    weights = torch.cat([uv, 1 - uv.sum(-1, keepdim=True)], -1)[0, meets]
+    depth = (patches[ids[0, meets].long()][:, [0, 3, 5], 2] * weights).sum(-1)
     if last:
         depth = depth / (farthest * depth - 1)
-    return torch.where(ids[0] >= 0, depth, torch.inf)
+    image = vertices.new_full((camera.height, camera.width), torch.inf)
+    image[meets] = depth
+    return image

@@ -12,8 +12,11 @@ Symbols: V images, R rays, K samples per ray, C features.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -30,15 +33,14 @@ from dyngs.human.predict.fields.network import (
     Perceptron,
     PointFeatures,
     SourceFeatures,
-    blend_colours,
     initialize_network,
     mean_and_variance,
     relative_directions,
     sample_maps,
     sample_offsets,
-    split_rays,
 )
-from dyngs.human.predict.people import DILATION, BodyBoundaries, PosedBody
+from dyngs.human.predict.keys import EgHumanNerfKeys
+from dyngs.human.predict.people import DILATION, PosedBody
 from dyngs.models.volume import camera_rays
 from dyngs.ops.rays import Rays
 
@@ -63,13 +65,16 @@ class EgHumanNerfParams:
 PARAMS = EgHumanNerfParams()
 HINTS = 8  # input features of a sample from the body and the silhouettes
 _FAR = 1e3  # depth of the background, m
+_EDGE = 0.05  # alpha of rays that miss the person; those above 1 - _EDGE hit it
 
 
 class EgHumanNerf(FieldNetwork):
     """EG-HumanNeRF network, see the module."""
 
-    def __init__(self, generator: torch.Generator) -> None:
-        super().__init__(PARAMS.features)
+    needs_depth = True
+
+    def __init__(self, generator: torch.Generator, keys: EgHumanNerfKeys | None = None) -> None:
+        super().__init__(PARAMS.features, keys)
         width = PARAMS.width
         pixel = PARAMS.features + FINE
         self.guide = Perceptron(2 * pixel + HINTS, width, width, 1)
@@ -78,81 +83,49 @@ class EgHumanNerf(FieldNetwork):
         colours = 3 + FINE
         self.blend = Perceptron(3 * colours + PARAMS.geometry + 5, width, width // 2, 1)
         self.sharpness = nn.Parameter(torch.tensor(math.log(PARAMS.sharpness), device="cpu"))
-        self.refine = Refinement()
+        self.refine = Refinement() if self.keys.refine else None
         initialize_network(self, generator)
+        last = [self.guide.layers[-1], self.surface.layers[-1]]
+        last += [] if self.refine is None else [self.refine.last]
         with torch.no_grad():  # start with the body surface and unchanged colours
-            for layer in (self.guide.layers[-1], self.surface.layers[-1], self.refine.last):
+            for layer in last:
                 layer.weight.mul_(0.1)  # pyright: ignore[reportCallIssue, reportAttributeAccessIssue]
 
-    needs_depth = True
-
-    def prepare(self, features: SourceFeatures, body: PosedBody) -> tuple[BodyBoundaries, Tensor]:
-        """Return the boundaries of the body, and its depth maps (V, 1, H, W) in the images, m."""
-        boundaries = BodyBoundaries(body)
+    def prepare(self, features: SourceFeatures, body: PosedBody) -> Tensor:
+        """Return the depth maps (V, 1, H, W) of the body in the images, m."""
         sources = features.sources
-        depths = torch.stack([boundaries.depth(sources.camera(i)) for i in range(len(sources))])
-        return boundaries, depths[:, None].clamp(max=_FAR).to(sources.rgba)
+        depths = [body.boundaries.depth(sources.camera(i)) for i in range(len(sources))]
+        return torch.stack(depths)[:, None].clamp(max=_FAR)
 
-    def render(
-        self, person: EncodedPerson, camera: Cameras, generator: torch.Generator | None = None
-    ) -> FieldPicture:
-        rays, z = camera_rays(camera)
-        boundaries, _ = person.extra
-        near, far, body_depth = (
-            (x.flatten() / z).clamp(max=_FAR)[:, None] for x in boundaries.interval(camera)
-        )
-        far = torch.where(near < _FAR, far, 0.0)
-        near = near.clamp_min(NEAR)
-        rows = (far > near).nonzero()[:, 0]
-        pieces = []
-        for piece in split_rays(rows):
-            limits = near[piece], far[piece], body_depth[piece]
-            pieces.append(self._along(person, rays[piece], limits, generator))
-        canvas = [
-            rays.origins.new_full((len(rays), size), fill)
-            for size, fill in ((3, 0), (1, 1), (1, 0))
-        ]
-        colour, through, depth = (
-            whole.index_copy(0, rows, torch.cat(parts)).view(camera.height, camera.width, -1)
-            for whole, *parts in zip(canvas, *(piece[:3] for piece in pieces), strict=True)
-        )
-        through = through[..., 0]
-        depth = depth[..., 0]
-        samples = [(rows, *pair) for pair in pieces[0][3]] if torch.is_grad_enabled() else []
-        middle = float((person.body.key_points.mean(0) - rays.origins[0]).norm())
-        return FieldPicture(self.refine(colour, through, depth, middle), through, depth, samples)
+    def limits(self, person: EncodedPerson, camera: Cameras, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Values are start and end of the sampled interval, and the distance of the body, m."""
+        depths = torch.stack(person.body.boundaries.interval(camera), -1).view(-1, 3)
+        limits = (depths / z[:, None]).clamp(NEAR, _FAR)
+        near, far, _ = limits.unbind(1)
+        return ((near < _FAR) & (far > near)).nonzero()[:, 0], limits
 
-    def _along(
-        self,
-        person: EncodedPerson,
-        rays: Rays,
-        limits: tuple[Tensor, Tensor, Tensor],
-        generator: torch.Generator | None,
-    ) -> tuple[Tensor, Tensor, Tensor, list[tuple[Tensor, Tensor]]]:
-        """Render rays.
+    def finish(self, person: EncodedPerson, picture: FieldPicture, center: Tensor) -> FieldPicture:
+        if self.refine is None:
+            return picture
+        middle = float((person.body.key_points.mean(0) - center).norm())
+        colour = self.refine(picture.colour, picture.transmittance, picture.depth, middle)
+        return replace(picture, colour=colour)
 
-        Args:
-            person: the encoded person.
-            rays: R of them.
-            limits: (R, 1) each: start and end of the sampled interval, and depth of the body.
-            generator: for random sample positions.
-
-        Returns:
-            Premultiplied colours (R, 3), transmittance (R, 1), weighted depths (R, 1), and
-            distances and signed ray distances (R, K) of the samples of both stages, m.
-        """
+    def march(
+        self, person: EncodedPerson, rays: Rays, limits: Tensor, generator: torch.Generator | None
+    ) -> tuple[Tensor, Sequence[Any]]:
+        """Intermediate results are distances and signed ray distances (R, K) of both stages, m."""
         features = person.features
-        boundaries, depths = person.extra
-        first, last, body = limits
+        first, last, body = limits.split(1, 1)
 
         def sample_at(at: Tensor) -> tuple[Tensor, PointFeatures, Tensor]:
             """Return points (R K, 3), their image features, and heights (R, K) above the body."""
             points = rays.origins[:, None] + rays.directions[:, None] * at[..., None]
             points = points.flatten(0, 1)
-            height = boundaries.height(points).view(at.shape)
+            height = person.body.boundaries.height(points).view(at.shape)
             return points, features.sample(points), height.clamp(-PARAMS.limit, PARAMS.limit)
 
-        def hints(pixel_features: PointFeatures, prior: Tensor, at: Tensor) -> Tensor:
+        def hints(seen: PointFeatures, height: Tensor, at: Tensor) -> Tensor:
             """Return input features (R K, HINTS) of ray samples.
 
             They are the distances to the body (signed, absolute, along the ray), the position in
@@ -161,72 +134,73 @@ class EgHumanNerf(FieldNetwork):
             """
             along = (body - at).clamp(-DILATION, DILATION) / DILATION
             place = (at - first) / (last - first)
-            limit = PARAMS.limit
-            parts = [prior / limit, prior.abs() / limit, along, place, closest / limit, max_alpha]
+            height = height / PARAMS.limit
+            parts = [height, height.abs(), along, place, closest / PARAMS.limit, max_alpha]
             rows = torch.stack([x.expand_as(at) for x in parts], -1).flatten(0, 1)
-            alpha = torch.stack([pixel_features.alpha.amin(0), pixel_features.alpha.mean(0)], -1)
-            return torch.cat([rows, alpha], -1)
+            return torch.cat([rows, seen.coverage], -1)
 
         count = PARAMS.samples
         shifts = sample_offsets(len(rays), count, generator=generator)
         at = first + (last - first) * (torch.arange(count, device="cpu") + shifts).to(first) / count
-        _, pixel_features, prior = sample_at(at)
-        closest = prior.amin(1, keepdim=True)
-        max_alpha = pixel_features.alpha.amin(0).view(at.shape).amax(1, keepdim=True)
-        facts = torch.cat(
-            [mean_and_variance(pixel_features.features), hints(pixel_features, prior, at)], -1
-        )
-        signed = prior + PARAMS.limit * self.guide(facts).view(at.shape)
+        _, seen, height = sample_at(at)
+        closest = height.amin(1, keepdim=True)
+        max_alpha = seen.alpha.amin(0).view(at.shape).amax(1, keepdim=True)
+        inputs = [mean_and_variance(seen.features), hints(seen, height, at)]
+        signed = height + PARAMS.limit * self.guide(torch.cat(inputs, -1)).view(at.shape)
 
         near = expected_surface(at.detach(), signed.detach())[:, None]
         near = near + at.new_tensor(PARAMS.offsets)
-        points, pixel_features, prior = sample_at(near)
+        points, seen, height = sample_at(near)
         grid, depth = features.project(points)
-        surface = sample_maps(depths, grid, "nearest")[..., 0].where(pixel_features.alpha > 0, _FAR)
-        hidden = depth > surface + PARAMS.hidden_by
-        # Images in which the sample is occluded, unless it is occluded in all.
+        surface = sample_maps(person.extra, grid, "nearest")[..., 0].where(seen.alpha > 0, _FAR)
+        behind = (depth - surface) / PARAMS.hidden_by
+        hidden = behind > 1
+        # Images in which the sample is hidden, unless it is hidden in all.
         excluded = 1e4 * (hidden & ~hidden.all(0))
+        if self.keys.hidden_views == "weighted":
+            hidden = behind.clamp(0, 2)
+            excluded = torch.zeros_like(hidden)
         directions = rays.directions.repeat_interleave(near.shape[1], 0)
         relative = relative_directions(directions, points, features.sources.centers)
         facts = torch.cat([hidden[..., None].to(relative), relative], -1)
-        logits = self.attention(torch.cat([pixel_features.features, facts], -1))[..., 0]
+        logits = self.attention(torch.cat([seen.features, facts], -1))[..., 0]
         weights = (logits - excluded).softmax(0)
-        known_here = [
-            mean_and_variance(pixel_features.features, weights),
-            hints(pixel_features, prior, near),
-        ]
-        output = self.surface(torch.cat(known_here, -1))
-        closer = interpolate_along_rays(at, signed, near) + PARAMS.limit * output[:, 0].view(
-            near.shape
-        )
-        per_view = torch.cat([pixel_features.rgb, pixel_features.features[..., -FINE:]], -1)
-        both = torch.cat([mean_and_variance(per_view, weights), output[:, 1:]], -1)
-        both = both.expand(len(per_view), -1, -1)
-        logits = self.blend(torch.cat([per_view, both, facts], -1))[..., 0]
-        colours = blend_colours(logits - excluded, pixel_features.rgb).view(*near.shape, 3)
+        inputs = [mean_and_variance(seen.features, weights), hints(seen, height, near)]
+        output = self.surface(torch.cat(inputs, -1))
+        change = PARAMS.limit * output[:, 0].view(near.shape)
+        closer = interpolate_along_rays(at, signed, near) + change
+        shared = torch.cat([mean_and_variance(seen.colours, weights), output[:, 1:]], -1)
+        colours = self.blend_images(seen, shared, [seen.colours, facts], excluded)
 
-        opacity = opacities(near, closer, self.sharpness.exp())
+        opacity = opacities(near, closer, self.sharpness.exp(), self.keys.density)
         through = torch.cumprod(torch.cat([torch.ones_like(opacity[:, :1]), 1 - opacity], 1), 1)
         weights = opacity * through[:, :-1]
-        colour = (weights[..., None] * colours).sum(1)
+        colour = (weights[..., None] * colours.view(*near.shape, 3)).sum(1)
         distance = (weights * near).sum(1, keepdim=True)
-        return colour, through[:, -1:], distance, [(at, signed), (near, closer)]
+        return torch.cat([colour, through[:, -1:], distance], 1), [(at, signed), (near, closer)]
 
     def penalty(self, picture: FieldPicture, image: Image, scale: float) -> Tensor:
-        """Return the mean signed ray distance error; rays hit the person if alpha exceeds 0.5."""
+        """Return the mean signed ray distance error of rays that hit or miss the person for sure.
+
+        Pixels on outlines show both; the image error alone decides about them.
+        """
         total = picture.colour.new_zeros(())
         assert image.depth is not None
         assert image.alpha is not None
-        _, z = camera_rays(image.cameras)
+        _, z = camera_rays(self.finer(image.cameras))
+        count = self.keys.supersampling
+        depth, alpha = (
+            x.repeat_interleave(count, 0).repeat_interleave(count, 1).flatten()
+            for x in (image.depth, image.alpha)
+        )
         limit = PARAMS.limit
         for rays, at, signed in picture.samples:
-            truth, alpha = (x.flatten()[rays][:, None] for x in (image.depth, image.alpha))
-            surface = truth / (scale * z[rays][:, None])
-            hits = alpha > 0.5
+            surface = (depth[rays] / (scale * z[rays]))[:, None]
             deviation = (signed - (surface - at).clamp(-limit, limit)).abs()
             # Rays that miss have no true distance; only values below a small margin are penalised.
-            error = torch.where(hits, deviation, (PARAMS.clear - signed).relu())
-            is_known = ~hits | (truth > 0)
+            misses = alpha[rays, None] < _EDGE
+            error = torch.where(misses, (PARAMS.clear - signed).relu(), deviation)
+            is_known = misses | ((alpha[rays, None] > 1 - _EDGE) & (surface > 0))
             error = torch.where(is_known, error, 0.0)
             total = total + error.sum() / (limit * at.shape[1] * is_known.sum().clamp_min(1))
         return PARAMS.srdf_weight * total
@@ -259,14 +233,20 @@ def interpolate_along_rays(at: Tensor, values: Tensor, queries: Tensor) -> Tenso
     return torch.lerp(values.gather(1, after - 1), values.gather(1, after), fraction)
 
 
-def opacities(at: Tensor, signed: Tensor, sharpness: Tensor) -> Tensor:
-    """Return NeuS opacities (R, K) (Wang et al. 2021) of signed ray distances (R, K) at (R, K).
+def opacities(at: Tensor, signed: Tensor, sharpness: Tensor, form: str = "neus") -> Tensor:
+    """Return opacities (R, K) of signed ray distances (R, K) at (R, K).
 
-    The cosine is -1, since signed ray distances are along the ray. Each sample covers half of the
-    neighbouring intervals.
+    Each sample covers half of the neighbouring intervals. ``form`` neus: differences of a sigmoid
+    (Wang et al. 2021) with cosine -1, since distances are along the ray. laplace: the density
+    alpha Psi(-s) with the Laplace distribution function Psi of scale beta (Yariv et al. 2021;
+    alpha = 1 / beta = ``sharpness``, per m).
     """
     gaps = at.diff(dim=1)
     half = (torch.cat([gaps[:, :1], gaps], 1) + torch.cat([gaps, gaps[:, -1:]], 1)) / 4
+    if form == "laplace":
+        tail = (-sharpness * signed.abs()).exp() / 2
+        density = sharpness * torch.where(signed > 0, tail, 1 - tail)
+        return 1 - (-2 * half * density).exp()
     before = (sharpness * (signed + half)).sigmoid()
     behind = (sharpness * (signed - half)).sigmoid()
     return ((before - behind + 1e-5) / (before + 1e-5)).clamp(0, 1)
@@ -278,12 +258,12 @@ class Refinement(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         widths = (16, 32, 64)
-        self.first = nn.Conv2d(5, widths[0], 3, padding=1)
-        self.down = nn.ModuleList(nn.Conv2d(i, o, 3, 2, 1) for i, o in pairwise(widths))
-        self.up = nn.ModuleList(
-            nn.Conv2d(i + o, o, 3, padding=1) for i, o in pairwise(widths[::-1])
-        )
-        self.last = nn.Conv2d(widths[0], 3, 3, padding=1)
+        # A patch of a training step goes on beyond its sides, as the image does.
+        conv = partial(nn.Conv2d, kernel_size=3, padding=1, padding_mode="replicate")
+        self.first = conv(5, widths[0])
+        self.down = nn.ModuleList(conv(i, o, stride=2) for i, o in pairwise(widths))
+        self.up = nn.ModuleList(conv(i + o, o) for i, o in pairwise(widths[::-1]))
+        self.last = conv(widths[0], 3)
 
     def forward(self, colour: Tensor, through: Tensor, depth: Tensor, middle: float) -> Tensor:
         """Return corrected premultiplied colours (H, W, 3).

@@ -11,7 +11,9 @@ Symbols: V images, M samples, J key points, R rays.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -24,18 +26,17 @@ from dyngs.human.predict.fields.network import (
     NEAR,
     EncodedPerson,
     FieldNetwork,
-    FieldPicture,
     Perceptron,
+    PointFeatures,
     SourceFeatures,
-    blend_colours,
     initialize_network,
     mean_and_variance,
     relative_directions,
     sample_offsets,
-    split_rays,
 )
+from dyngs.human.predict.keys import EgHumanNerfKeys
 from dyngs.human.predict.people import NUM_KEY_POINTS, PosedBody, Sources
-from dyngs.models.volume import camera_rays, reached_samples, select_samples, thin_samples
+from dyngs.models.volume import reached_samples, select_samples, thin_samples
 from dyngs.ops.rays import MarchSteps, Rays, Samples, Space, composite, march
 
 
@@ -66,8 +67,8 @@ HINTS = 4  # input features of a sample from bones and silhouettes
 class KeypointNerf(FieldNetwork):
     """KeypointNeRF network, see the module."""
 
-    def __init__(self, generator: torch.Generator) -> None:
-        super().__init__(PARAMS.features)
+    def __init__(self, generator: torch.Generator, keys: EgHumanNerfKeys | None = None) -> None:
+        super().__init__(PARAMS.features, keys)
         width = PARAMS.width
         colours = 3 + FINE + PARAMS.geometry
         self.per_image = Perceptron(CODE + PARAMS.features + FINE, width, width, PARAMS.pooled)
@@ -78,24 +79,15 @@ class KeypointNerf(FieldNetwork):
     def prepare(self, features: SourceFeatures, body: PosedBody) -> tuple[Space, Tensor]:
         return visual_hull(features, body.key_points)
 
-    def render(
-        self, person: EncodedPerson, camera: Cameras, generator: torch.Generator | None = None
-    ) -> FieldPicture:
-        rays, _ = camera_rays(camera)
-        shifts = sample_offsets(len(rays), generator=generator).to(rays.origins)
-        pieces = split_rays(torch.arange(len(rays), device=shifts.device))
-        found = [self._along(person, rays[some], shifts[some]) for some in pieces]
-        colour, through, depth = (torch.cat(x) for x in zip(*found, strict=True))
-        shape = camera.height, camera.width
-        return FieldPicture(colour.view(*shape, 3), through.view(shape), depth.view(shape))
+    def limits(self, person: EncodedPerson, camera: Cameras, z: Tensor) -> tuple[Tensor, Tensor]:
+        return torch.arange(len(z), device=z.device), z[:, None]
 
-    def _along(
-        self, person: EncodedPerson, rays: Rays, shifts: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Render rays; return premultiplied colours (R, 3), transmittance (R,) and weighted depths
-        (R,)."""
+    def march(
+        self, person: EncodedPerson, rays: Rays, limits: Tensor, generator: torch.Generator | None
+    ) -> tuple[Tensor, Sequence[Any]]:
         features = person.features
         space, occupied = person.extra
+        shifts = sample_offsets(len(rays), generator=generator).to(rays.origins)
         samples = march(rays, shifts, space, occupied, MarchSteps(NEAR, PARAMS.step))
         is_training = torch.is_grad_enabled()
         with torch.no_grad():  # densities alone decide which samples are rendered
@@ -103,55 +95,39 @@ class KeypointNerf(FieldNetwork):
             samples = select_samples(samples, alpha.all(0))[0]
             points = sample_positions(samples, space)
             code = spatial_code(points, person.body.key_points, features.sources)
-            geometry = self._geometry(person, points, code)
+            seen = features.sample(points)
+            geometry = self._geometry(person, points, code, seen)
             if is_training:
                 samples, which = thin_samples(density(geometry), samples, shifts)
             else:
                 samples, which = reached_samples(density(geometry), samples)
             points = points[which]
-            geometry = geometry[which]
-        if is_training:
-            geometry = self._geometry(person, points, code[:, which])
-        densities = density(geometry)
-        colours = self._colours(features, geometry, points, rays.directions[samples.rays.long()])
-        composite_background = composite(densities, colours, samples)
-        return (
-            composite_background.colour,
-            composite_background.transmittance,
-            composite_background.depth,
+        seen = features.sample(points)
+        geometry = (
+            self._geometry(person, points, code[:, which], seen) if is_training else geometry[which]
         )
+        per_view = torch.cat(
+            [seen.colours, geometry[:, 1:].expand(len(features.sources), -1, -1)], -1
+        )
+        directions = rays.directions[samples.rays.long()]
+        directions = relative_directions(directions, points, features.sources.centers)
+        colours = self.blend_images(seen, mean_and_variance(per_view), [per_view, directions])
+        image = composite(density(geometry), colours, samples)
+        return torch.cat([image.colour, image.transmittance[:, None], image.depth[:, None]], 1), []
 
-    def _geometry(self, person: EncodedPerson, points: Tensor, code: Tensor) -> Tensor:
+    def _geometry(
+        self, person: EncodedPerson, points: Tensor, code: Tensor, seen: PointFeatures
+    ) -> Tensor:
         """Return raw density and geometry features (M, 1 + PARAMS.geometry) of points (M, 3).
 
         The initial density is that of limbs of constant thickness.
         """
-        pixel_features = person.features.sample(points)
         bone = distance_to_bones(points, person.body.key_points)[:, None]
-        per_image = self.per_image(torch.cat([code, pixel_features.features], -1))
-        alpha = torch.stack([pixel_features.alpha.amin(0), pixel_features.alpha.mean(0)], -1)
-        hints = torch.cat([bone / PARAMS.reach, (bone / PARAMS.reach).square(), alpha], -1)
+        per_image = self.per_image(torch.cat([code, seen.features], -1))
+        distance = bone / PARAMS.reach
+        hints = torch.cat([distance, distance.square(), seen.coverage], -1)
         output = self.geometry(torch.cat([mean_and_variance(per_image), hints], -1))
         return torch.cat([output[:, :1] + PARAMS.steep * (PARAMS.thick - bone), output[:, 1:]], -1)
-
-    def _colours(
-        self, features: SourceFeatures, geometry: Tensor, points: Tensor, directions: Tensor
-    ) -> Tensor:
-        """Return colours (M, 3), blended from the images."""
-        pixel_features = features.sample(points)
-        count = len(features.sources)
-        per_view = torch.cat(
-            [
-                pixel_features.rgb,
-                pixel_features.features[..., -FINE:],
-                geometry[:, 1:].expand(count, -1, -1),
-            ],
-            -1,
-        )
-        pooled = mean_and_variance(per_view).expand(count, -1, -1)
-        directions_between = relative_directions(directions, points, features.sources.centers)
-        logits = self.blend(torch.cat([per_view, pooled, directions_between], -1))[..., 0]
-        return blend_colours(logits, pixel_features.rgb)
 
 
 def density(geometry: Tensor) -> Tensor:

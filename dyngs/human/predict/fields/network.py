@@ -1,6 +1,6 @@
 """Common parts of networks that predict radiance fields of people.
 
-Symbols: V images, M points, C features, D values per point.
+Symbols: V images, M points, P rays of a camera, C features, D values per point.
 """
 
 from __future__ import annotations
@@ -18,9 +18,12 @@ from torch.nn.functional import grid_sample
 from dyngs.core.camera import Cameras
 from dyngs.core.initialisation import glorot
 from dyngs.data.loader import Image
+from dyngs.human.predict.keys import EgHumanNerfKeys
 from dyngs.human.predict.people import PosedBody, Sources
 from dyngs.models.prediction import Encoder, initialize_weights, upsample
+from dyngs.models.volume import camera_rays
 from dyngs.ops.perceptron import Layer, perceptron
+from dyngs.ops.rays import Rays
 
 FINE = 8
 """Features per pixel at half resolution, next to the coarse ones at a quarter."""
@@ -66,6 +69,16 @@ class PointFeatures:
     rgb: Tensor  # (V, M, 3) straight colours
     alpha: Tensor  # (V, M), 0 outside the image
 
+    @property
+    def colours(self) -> Tensor:
+        """Colours and fine features (V, M, 3 + FINE)."""
+        return torch.cat([self.rgb, self.features[..., -FINE:]], -1)
+
+    @property
+    def coverage(self) -> Tensor:
+        """Smallest and mean alpha over the images (M, 2)."""
+        return torch.stack([self.alpha.amin(0), self.alpha.mean(0)], -1)
+
 
 @dataclass(frozen=True)
 class SourceFeatures:
@@ -79,9 +92,17 @@ class SourceFeatures:
         """Sample images and features at points (M, 3); differentiable in the features."""
         grid, _ = self.project(points)
         rgba = sample_maps(self.sources.rgba, grid)
-        features = torch.cat([sample_maps(self.coarse, grid), sample_maps(self.fine, grid)], -1)
+        # Convolutions with stride s centre feature i on pixel s i: half of s - 1 px before the
+        # middle of the pixels that a map of 1/s of the resolution is sampled as.
+        pixel = 1 / grid.new_tensor(self.sources.rgba.shape[:1:-1])
+        features = [
+            sample_maps(self.coarse, grid + 3 * pixel),
+            sample_maps(self.fine, grid + pixel),
+        ]
         return PointFeatures(
-            features, rgba[..., :3] / rgba[..., 3:].clamp_min(_MIN_ALPHA), rgba[..., 3]
+            torch.cat(features, -1),
+            rgba[..., :3] / rgba[..., 3:].clamp_min(_MIN_ALPHA),
+            rgba[..., 3],
         )
 
     def alpha(self, points: Tensor) -> Tensor:
@@ -121,10 +142,10 @@ def mean_and_variance(values: Tensor, weights: Tensor | None = None) -> Tensor:
     """Return mean and variance (M, 2 D) over views of values (V, M, D), with weights (V, M) that
     sum to 1."""
     if weights is None:
-        weights = values.new_full((len(values), 1), 1 / len(values))
-    fractions = weights[..., None]
-    mean = (fractions * values).sum(0)
-    return torch.cat([mean, (fractions * (values - mean).square()).sum(0)], -1)
+        mean = values.mean(0)
+        return torch.cat([mean, (values - mean).square().mean(0)], -1)
+    mean = (weights[..., None] * values).sum(0)
+    return torch.cat([mean, (weights[..., None] * (values - mean).square()).sum(0)], -1)
 
 
 def relative_directions(directions: Tensor, points: Tensor, centers: Tensor) -> Tensor:
@@ -136,11 +157,6 @@ def relative_directions(directions: Tensor, points: Tensor, centers: Tensor) -> 
     source_directions = torch.nn.functional.normalize(points - centers[:, None], dim=-1)
     difference = torch.nn.functional.normalize(directions - source_directions, dim=-1)
     return torch.cat([difference, (directions * source_directions).sum(-1, keepdim=True)], -1)
-
-
-def blend_colours(logits: Tensor, colours: Tensor) -> Tensor:
-    """Blend colours (V, M, 3) of V images by the softmax of ``logits`` (V, M); return (M, 3)."""
-    return (logits.softmax(0)[..., None] * colours).sum(0)
 
 
 def split_rays(rays: Tensor) -> Sequence[Tensor]:
@@ -182,9 +198,11 @@ class FieldNetwork(nn.Module, ABC):
     """Network that predicts a radiance field of a person from images and a posed body."""
 
     needs_depth: ClassVar[bool] = False  # whether training needs depth maps
+    blend: Perceptron  # logits of the images' colours
 
-    def __init__(self, features: int) -> None:
+    def __init__(self, features: int, keys: EgHumanNerfKeys | None) -> None:
         super().__init__()
+        self.keys: Any = keys or EgHumanNerfKeys()
         self.encoder = ImageEncoder(features)
 
     def encode(self, sources: Sources, body: PosedBody) -> EncodedPerson:
@@ -197,6 +215,22 @@ class FieldNetwork(nn.Module, ABC):
         """Return ``EncodedPerson.extra``."""
 
     @abstractmethod
+    def limits(self, person: EncodedPerson, camera: Cameras, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the indices (R,) of rays that may hit the person, and values (P, D) of all rays.
+
+        ``z`` (P,) is the depth at distance 1 along each ray of the camera.
+        """
+
+    @abstractmethod
+    def march(
+        self, person: EncodedPerson, rays: Rays, limits: Tensor, generator: torch.Generator | None
+    ) -> tuple[Tensor, Sequence[Any]]:
+        """Render R rays with their ``limits`` (R, D).
+
+        Returns premultiplied colours, transmittance and weighted distances (R, 5), and
+        intermediate results for ``penalty``.
+        """
+
     def render(
         self, person: EncodedPerson, camera: Cameras, generator: torch.Generator | None = None
     ) -> FieldPicture:
@@ -204,6 +238,54 @@ class FieldNetwork(nn.Module, ABC):
 
         ``generator`` places samples at random, as in training; None: evenly.
         """
+        count = self.keys.supersampling
+        finer = self.finer(camera)
+        rays, z = camera_rays(finer)
+        rows, limits = self.limits(person, finer, z)
+        found = [
+            self.march(person, rays[piece], limits[piece], generator) for piece in split_rays(rows)
+        ]
+        canvas = z.new_tensor([0.0, 0.0, 0.0, 1.0, 0.0]).repeat(len(z), 1)
+        canvas = canvas.index_copy(0, rows, torch.cat([values for values, _ in found]))
+        canvas = canvas.view(camera.height, count, camera.width, count, 5).mean((1, 3))
+        samples = [(rows, *pair) for pair in found[0][1]] if torch.is_grad_enabled() else []
+        picture = FieldPicture(canvas[..., :3], canvas[..., 3], canvas[..., 4], samples)
+        return self.finish(person, picture, rays.origins[0])
+
+    def finer(self, camera: Cameras) -> Cameras:
+        """Return a camera with ``supersampling`` rays per pixel and axis."""
+        count = self.keys.supersampling
+        scale = camera.intrinsics.new_tensor([count, count, 1])[:, None]
+        return Cameras(
+            camera.cam_from_world,
+            scale * camera.intrinsics,
+            count * camera.width,
+            count * camera.height,
+        )
+
+    def finish(self, person: EncodedPerson, picture: FieldPicture, center: Tensor) -> FieldPicture:
+        """Return the final picture of a camera at ``center`` (3,)."""
+        return picture
+
+    def blend_images(
+        self,
+        seen: PointFeatures,
+        shared: Tensor,
+        own: Sequence[Tensor],
+        excluded: Tensor | float = 0.0,
+    ) -> Tensor:
+        """Return the colours (M, 3) of points, blended from the images.
+
+        Args:
+            seen: features of the points.
+            shared: (M, D) features of the points that all images share.
+            own: features (V, M, D) of the points in each image.
+            excluded: (V, M) subtracted from the logits of the weights.
+        """
+        first, *others = own
+        inputs = torch.cat([first, shared.expand(len(first), -1, -1), *others], -1)
+        weights = (self.blend(inputs)[..., 0] - excluded).softmax(0)
+        return (weights[..., None] * seen.rgb).sum(0)
 
     def penalty(self, picture: FieldPicture, image: Image, scale: float) -> Tensor:
         """Return loss terms besides the image error; ``scale``: depth map units per metre."""

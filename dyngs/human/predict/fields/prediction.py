@@ -28,10 +28,12 @@ from dyngs.human.predict.fields.eg_human_nerf import EgHumanNerf
 from dyngs.human.predict.fields.keypoint_nerf import AROUND, KeypointNerf
 from dyngs.human.predict.fields.network import EncodedPerson, FieldNetwork
 from dyngs.human.predict.gps.rectification import (
+    MAX_ANGLE,
     MIN_ANGLE,
     angle_between_views,
     spread,
     spread_around_person,
+    training_pairs,
     views_by_time,
 )
 from dyngs.human.predict.keys import FieldPredictorModel, PredictedFieldModel
@@ -68,11 +70,11 @@ from dyngs.models.renderable import (
 from dyngs.models.views import evaluation_background
 from dyngs.ops.device import CPU, select_device
 
-NETWORKS: dict[str, Callable[[torch.Generator], FieldNetwork]] = {
+NETWORKS: dict[str, Callable[..., FieldNetwork]] = {
     "keypoint_nerf": KeypointNerf,
     "eg_human_nerf": EgHumanNerf,
 }
-"""Untrained networks, by ``model.kind``."""
+"""Untrained networks of a generator and keys, by ``model.kind``."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -108,7 +110,8 @@ class PredictedField(Renderable):
     def state(self) -> State:
         tensors = {f"network.{name}": x.detach() for name, x in self.network.state_dict().items()}
         tensors |= {f"sources.{name}": x for name, x in vars(self.sources).items()}
-        tensors |= {f"body.{name}": x for name, x in vars(self.body).items()}
+        body = {x.name: getattr(self.body, x.name) for x in dataclasses.fields(self.body)}
+        tensors |= {f"body.{name}": x for name, x in body.items()}
         tensors["numbers"] = torch.tensor([self.scale], dtype=torch.float64, device="cpu")
         return add_prefix("field", with_role(tensors, Role.SHARED))
 
@@ -137,24 +140,26 @@ class PredictedField(Renderable):
 def restore(model: PredictedFieldModel, checkpoint: Checkpoint) -> PredictedField:
     """Restore the field of a checkpoint. Raises KeyError or ValueError: tensors do not fit."""
     stored = checkpoint.part("field")
+
+    def tensor(name: str, *shape: int | None) -> Tensor:
+        return require_tensor(name, stored[name], shape)
+
     # Earlier versions also stored network sizes, after the scale.
     numbers = require_tensor("numbers", stored["numbers"][:1], (1,), torch.float64)
     require_positive("scale", numbers)
-    network = NETWORKS[model.network](torch.Generator())
+    network = NETWORKS[model.network](torch.Generator(), model)
     load_weights(network, checkpoint, "field.network")
-    rgba = require_tensor("rgba", stored["sources.rgba"], (None, 4, None, None))
+    rgba = tensor("sources.rgba", None, 4, None, None)
     count, _, height, width = rgba.shape
     if not rgba.numel() or height % MULTIPLE or width % MULTIPLE:
         raise ValueError(f"'rgba' has an invalid shape: {tuple(rgba.shape)}")
-    poses = require_tensor("cam_from_world", stored["sources.cam_from_world"], (count, 4, 4))
-    intrinsics = require_tensor("intrinsics", stored["sources.intrinsics"], (count, 3, 3))
-    points = require_tensor("key_points", stored["body.key_points"], (None, 3))
-    vertices = require_tensor("vertices", stored["body.vertices"], (None, 3))
+    poses = tensor("sources.cam_from_world", count, 4, 4)
+    vertices = tensor("body.vertices", None, 3)
     faces = require_indices("faces", stored["body.faces"], (None, 3), len(vertices))
     return PredictedField(
         network,
-        Sources(rgba, poses, intrinsics),
-        PosedBody(points, vertices, faces),
+        Sources(rgba, poses, tensor("sources.intrinsics", count, 3, 3)),
+        PosedBody(tensor("body.key_points", None, 3), vertices, faces),
         float(numbers[0]),
         background=evaluation_background(checkpoint.info.background, False)[1],
     )
@@ -207,7 +212,6 @@ class PredictedModel(Model[PredictedField]):
 
 
 FEWEST_VIEWS = 2
-PATCH = 32  # side of the image patch of a training step, px
 _MIN_ALPHA = 0.5  # alpha of pixels that patches are centred on
 
 
@@ -240,7 +244,9 @@ class FieldPredictor(Predictor[FieldNetwork]):
     def run_config(self, views: Sequence[int]) -> Config:
         times = distinct_times(self.views).values()
         data = self.data_at_time(self.views[views[0]].time, times)
-        model = PredictedFieldModel.model_validate({"network": self.config.model.kind})
+        keys = set(PredictedFieldModel.model_fields) & set(type(self.section).model_fields)
+        options = {name: getattr(self.section, name) for name in keys - {"kind"}}
+        model = PredictedFieldModel.model_validate({"network": self.section.kind} | options)
         return self.config.model_copy(update={"data": data, "model": model})
 
     def begin(self, model: Any, scene: Renderable, config: Config) -> None:
@@ -264,12 +270,12 @@ class FieldLearner(Learner[FieldNetwork]):
     def example(self, person: int, step: int, generator: torch.Generator) -> Example:
         captured = self._opened(person)
         sources, target = self._views(captured, generator)
-        body, scale = captured.body_in(captured.views[target])
-        body = move_fields_to(body, self.device)
+        body, scale = captured.body_in(captured.views[target], self.device)
         sources_in = move_fields_to(
             crop_source_images([captured.images[i] for i in sources], scale), self.device
         )
-        image = _random_patch(captured.images[target], generator).to(self.device)
+        image = captured.images[target]
+        image = _random_patch(image, self.section.patch, generator).to(self.device)
         background = self.sample_background(generator)
         encoded = self.network.encode(sources_in, body)
         field_picture = self.network.render(
@@ -285,7 +291,11 @@ class FieldLearner(Learner[FieldNetwork]):
 
     def _views(self, person: Person, generator: torch.Generator) -> tuple[list[int], int]:
         """Choose source views of one time step, every other time evenly around the person, and a
-        target view."""
+        target view; or a pair and a view between."""
+        if self.section.training_views == "between":
+            pairs = training_pairs(person.views)
+            pair, between = pairs[random_index(len(pairs), generator)]
+            return list(pair), between[random_index(len(between), generator)]
         rings = [ring for ring in views_by_time(person.views).values() if len(ring) > FEWEST_VIEWS]
         ring = rings[random_index(len(rings), generator)]
         max_count = min(self.section.source_views, len(ring) - 1)
@@ -301,6 +311,11 @@ class FieldLearner(Learner[FieldNetwork]):
     def _open(self, data: DataConfig) -> Person:
         """Return a person to train on. Raises DyngsError: too few views, or no depth maps."""
         captured = read_captured_person(data, self._template)
+        if self.section.training_views == "between" and not training_pairs(captured.views):
+            raise DyngsError(
+                f"{data.root}: no view lies between two others at most {MAX_ANGLE:g} degrees "
+                "apart; use model.training_views=any"
+            )
         if all(len(ring) <= FEWEST_VIEWS for ring in views_by_time(captured.views).values()):
             raise DyngsError(f"{data.root}: training needs a time step with three or more views")
         if self.network.needs_depth and any(view.depth_path is None for view in captured.views):
@@ -311,20 +326,20 @@ class FieldLearner(Learner[FieldNetwork]):
         return captured
 
 
-def _random_patch(image: Image, generator: torch.Generator) -> Image:
+def _random_patch(image: Image, side: int, generator: torch.Generator) -> Image:
     """Return a patch around a random pixel of the person."""
     assert image.alpha is not None
     where = (image.alpha > _MIN_ALPHA).nonzero()
     if not len(where):
-        return crop_window(image, 0, 0, PATCH)
+        return crop_window(image, 0, 0, side)
     row, column = where[random_index(len(where), generator)].tolist()
-    return crop_window(image, column - PATCH // 2, row - PATCH // 2, PATCH)
+    return crop_window(image, column - side // 2, row - side // 2, side)
 
 
 def learner(config: Config, generator: torch.Generator) -> FieldLearner:
     """Return the network in training, before the first step."""
     device = select_device(config.run.device)
-    network = NETWORKS[config.model.kind](generator).to(device)
+    network = NETWORKS[config.model.kind](generator, config.model).to(device)
     return FieldLearner(config, network, list_captures(config.data), device)
 
 
@@ -341,7 +356,7 @@ def predictor(
     ``log`` and ``on_progress`` receive messages and progress of that fit.
     """
     model: Any = config.model
-    network = NETWORKS[model.kind](torch.Generator())
+    network = NETWORKS[model.kind](torch.Generator(), model)
     load_weights(network, checkpoint)
     if model.body is None:
         data = ensure_fitted_body(data, only_if_needed=True, log=log, on_progress=on_progress)

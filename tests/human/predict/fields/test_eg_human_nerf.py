@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
 import torch
 
+from dyngs.core.camera import Cameras
 from dyngs.human.predict.fields.eg_human_nerf import (
     PARAMS,
     EgHumanNerf,
+    Refinement,
     expected_surface,
     opacities,
 )
-from dyngs.human.predict.fields.network import EncodedPerson
+from dyngs.human.predict.fields.keypoint_nerf import KeypointNerf
+from dyngs.human.predict.fields.network import EncodedPerson, FieldNetwork
+from dyngs.human.predict.keys import EgHumanNerfKeys
 from dyngs.human.predict.people import (
     BodyBoundaries,
     Person,
@@ -23,11 +28,11 @@ from dyngs.human.predict.people import (
 )
 
 
-def network_with() -> EgHumanNerf:
-    return EgHumanNerf(torch.Generator().manual_seed(0))
+def network_with(**keys: object) -> EgHumanNerf:
+    return EgHumanNerf(torch.Generator().manual_seed(0), EgHumanNerfKeys.model_validate(keys))
 
 
-def known(network: EgHumanNerf, person: Person) -> EncodedPerson:
+def known(network: FieldNetwork, person: Person) -> EncodedPerson:
     body, scale = person.body_in(person.views[0])
     return network.encode(crop_source_images([person.images[i] for i in (0, 2, 4)], scale), body)
 
@@ -58,6 +63,104 @@ def test_a_surface_hides_what_is_behind_it_and_nothing_else_is_opaque() -> None:
     )
     missed = opacities(at, torch.full_like(at, PARAMS.limit), torch.tensor(400.0))
     assert float((1 - missed).prod()) > 0.99
+
+
+def test_laplace_opacities_integrate_the_density() -> None:
+    """sigma = alpha Psi(-s) with alpha = 1 / beta, in float64 by many small steps; then the limits
+    of one sample."""
+    sharpness = 150.0
+    at = torch.linspace(0.95, 1.05, 4001, dtype=torch.float64)[None]
+    found = opacities(at, 1.0 - at, torch.tensor(sharpness), "laplace")
+    through = float((1 - found).prod())
+    step = 0.1 / 4000
+    depth = 0.0
+    for x in at[0].tolist():
+        tail = 0.5 * math.exp(-sharpness * abs(1.0 - x))
+        depth += step * sharpness * (tail if x < 1 else 1 - tail)
+    assert through == pytest.approx(math.exp(-depth), rel=1e-9)
+    gaps = torch.tensor([[1.0, 1.01, 1.03]])
+    middle = opacities(gaps, torch.zeros_like(gaps), torch.tensor(sharpness), "laplace")[0, 1]
+    assert float(middle) == pytest.approx(1 - math.exp(-sharpness / 2 * 0.015), rel=1e-5)
+
+
+@pytest.mark.parametrize("form", ["neus", "laplace"])
+def test_gradients_of_opacities(form: str) -> None:
+    generator = torch.Generator().manual_seed(0)
+    at = torch.rand(3, 5, generator=generator, dtype=torch.float64).sort(1).values
+    signed = torch.randn(3, 5, generator=generator, dtype=torch.float64, requires_grad=True)
+    sharpness = torch.tensor(2.0, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda s, x: opacities(at, s, x, form), (signed, sharpness))
+
+
+@pytest.mark.parametrize("mode", ["excluded", "weighted"])
+def test_hidden_views_are_excluded_or_weighted(person: Person, mode: str) -> None:
+    """Colours of an image in which the body hides all samples count only where it is weighted.
+
+    Samples beside its silhouette are not hidden.
+    """
+    network = network_with(hidden_views=mode, refine=False)
+    own = known(network, person)
+    camera = cameras_in_metres(person.images[1].cameras, person.body_in(person.views[0])[1])
+    hidden = torch.full_like(own.extra, 1e3)
+    hidden[1] = 0
+    pictures = []
+    with torch.no_grad():
+        for colour in (0.0, 1.0):
+            rgba = own.features.sources.rgba.clone()
+            rgba[1, :3] = colour * rgba[1, 3:]
+            sources = replace(own.features.sources, rgba=rgba)
+            features = replace(own.features, sources=sources)
+            pictures.append(
+                network.render(replace(own, features=features, extra=hidden), camera).colour
+            )
+    alpha = person.images[1].alpha
+    assert alpha is not None
+    difference = float((pictures[0] - pictures[1]).abs().amax(-1)[alpha > 0.9].median())
+    assert (difference < 1e-6) == (mode == "excluded")
+    assert difference < 1
+
+
+def test_without_refinement_a_window_is_part_of_the_whole(person: Person) -> None:
+    network = network_with(refine=False)
+    assert not any(name.startswith("refine") for name, _ in network.named_parameters())
+    own = known(network, person)
+    scale = person.body_in(person.views[0])[1]
+    with torch.no_grad():
+        whole = network.render(own, cameras_in_metres(person.images[1].cameras, scale))
+        window = crop_window(person.images[1], 8, 10, 16).cameras
+        part = network.render(own, cameras_in_metres(window, scale))
+    torch.testing.assert_close(part.colour, whole.colour[10:26, 8:24], atol=1e-4, rtol=1e-3)
+
+
+def test_refinement_does_not_see_the_sides_of_a_patch() -> None:
+    """It treats a patch of even colour evenly, up to its sides."""
+    refinement = Refinement()
+    even = torch.full((12, 20), 0.2)
+    colour = torch.tensor([0.3, 0.5, 0.1]).expand(12, 20, 3)
+    found = refinement(colour, even, 2 * even, 2.5)
+    torch.testing.assert_close(found, found[:1, :1].expand_as(found), atol=1e-5, rtol=1e-5)
+    assert not torch.equal(found[0, 0], colour[0, 0])
+
+
+@pytest.mark.parametrize("network_of", [EgHumanNerf, KeypointNerf])
+def test_supersampling_averages_rays(network_of: type[FieldNetwork], person: Person) -> None:
+    keys = EgHumanNerfKeys(supersampling=2, refine=False)
+    network = network_of(torch.Generator().manual_seed(0), keys)  # pyright: ignore[reportCallIssue, reportArgumentType]
+    own = known(network, person)
+    scale = person.body_in(person.views[0])[1]
+    camera = cameras_in_metres(person.images[1].cameras, scale)
+    intrinsics = camera.intrinsics.clone()
+    intrinsics[:, :2] *= 2
+    doubled = Cameras(camera.cam_from_world, intrinsics, 2 * camera.width, 2 * camera.height)
+    with torch.no_grad():
+        soft = network.render(own, camera)
+        network.keys = EgHumanNerfKeys(refine=False)
+        fine = network.render(own, doubled)
+        hard = network.render(own, camera)
+    for name in ("colour", "transmittance", "depth"):
+        values = getattr(fine, name).view(camera.height, 2, camera.width, 2, -1).mean((1, 3))
+        torch.testing.assert_close(getattr(soft, name), values.view_as(getattr(soft, name)))
+    assert float((soft.transmittance - hard.transmittance).abs().max()) > 0.1
 
 
 def test_an_untrained_network_shows_the_body(person: Person) -> None:
@@ -140,3 +243,5 @@ def test_penalty_compares_distances_with_depth_maps(person: Person) -> None:
         true.append((rays, at, signed))
     told = float(network.penalty(replace(picture, samples=true), image, scale))
     assert told < 1e-4 < off
+    outline = replace(image, alpha=torch.full_like(image.alpha, 0.5))
+    assert float(network.penalty(picture, outline, scale)) == 0, "half covered pixels show both"

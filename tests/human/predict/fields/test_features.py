@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from dyngs.human.predict.fields.network import SourceFeatures
+from dyngs.human.predict.fields.network import ImageEncoder, SourceFeatures
 from dyngs.human.predict.people import Sources
 
 FOCAL, WIDTH, HEIGHT = 20.0, 32, 24
@@ -38,3 +38,20 @@ def test_points_show_what_their_pixels_show() -> None:
     assert looked.alpha[1, 2] == 0.5, "13 m before the other one"
     assert bool((looked.alpha[:, 3] == 0).all()), "beside the images"
     assert looked.features.shape == (2, 4, 5)
+
+
+def test_features_are_sampled_where_convolutions_centre_them() -> None:
+    """Feature i at 1/4 of the resolution is that of pixel 4 i, not of the middle of four."""
+    layers = [layer[0] for layer in ImageEncoder(8).levels.down][:2]
+    images = torch.randn(2, 4, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0))
+    found = images
+    for layer, stride in zip(layers, (2, 4), strict=True):
+        torch.nn.init.dirac_(layer.weight)
+        torch.nn.init.zeros_(layer.bias)
+        found = layer(found)
+        torch.testing.assert_close(found[:, :4], images[..., ::stride, ::stride])
+    points = torch.tensor([[0.5, -0.25, 0.0], [0.2, 0.1, 1.0], [-0.4, 0.3, -0.5]])
+    looked = seen().sample(points)
+    colours = 0.5 * looked.rgb  # premultiplied, and linear in the image
+    torch.testing.assert_close(looked.features[..., :2], colours[..., :2])
+    torch.testing.assert_close(looked.features[..., 3:], colours[..., :2])

@@ -12,13 +12,17 @@ import torch
 from PIL import Image
 from refused import error_line
 from stopped import stopped
-from tiny_field_people import NETWORKS, field_config
+from tiny_field_people import NETWORKS, field_config, field_people
 
 from dyngs.api.predict import predict
 from dyngs.api.train import train
+from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
-from dyngs.human.predict.fields.prediction import PredictedField
+from dyngs.human.body.body_reader import default_template
+from dyngs.human.predict.fields.prediction import FieldLearner, PredictedField
+from dyngs.human.predict.gps.rectification import angle_between_views
+from dyngs.human.predict.people import read_captured_person
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
 from dyngs.training.prediction import network_trainer
 
@@ -34,7 +38,7 @@ def run(
     )
 
 
-def read_captured_person(folder: Path) -> Path:
+def second_person(folder: Path) -> Path:
     return folder / "s0000" / "p000001"
 
 
@@ -60,20 +64,64 @@ def test_training_lowers_the_error(folder: Path, tmp_path: Path, kind: str) -> N
     assert error() < 0.985 * before
 
 
+ALTERNATIVES = {"training_views": "between", "patch": 12, "supersampling": 2}
+EG_ALTERNATIVES = {"density": "laplace", "hidden_views": "weighted", "refine": False}
+
+
+@pytest.fixture(scope="module")
+def ring(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One person before 16 cameras, so that views lie between neighbours."""
+    return field_people(tmp_path_factory.mktemp("ring") / "people", people=1, cameras=16)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_other_keys_resume_predict_and_restore(ring: Path, tmp_path: Path, kind: str) -> None:
+    keys = ALTERNATIVES | (EG_ALTERNATIVES if kind == "eg_human_nerf" else {})
+    whole = train(field_config(kind, ring, tmp_path / kind, keys))
+    config = field_config(kind, ring, tmp_path / "parts", keys)
+    resumed = train(config, resume_from=stopped(config, 2))
+    assert checkpoint_paths(resumed)[-1].read_bytes() == checkpoint_paths(whole)[-1].read_bytes()
+    made = predict(whole, ring / "s0000" / "p000000", tmp_path / "two", 2)
+    found = load_run(made.run_dir)
+    assert isinstance(found.renderable, PredictedField)
+    for name, value in keys.items():
+        if name in type(found.config.model).model_fields:
+            assert getattr(found.config.model, name) == value
+            assert getattr(found.renderable.network.keys, name) == value
+
+
+def test_examples_between_two_views_are_of_neighbours(
+    ring: Path, folder: Path, tmp_path: Path
+) -> None:
+    config = field_config("keypoint_nerf", ring, tmp_path, ALTERNATIVES)
+    learner: FieldLearner = network_trainer(config).learner  # pyright: ignore[reportAssignmentType]
+    person = read_captured_person(DataConfig(root=ring / "s0000" / "p000000"), default_template())
+    views = person.views
+    for seed in range(20):
+        (left, right), target = learner._views(person, torch.Generator().manual_seed(seed))
+        apart = angle_between_views(views[left], views[right])
+        assert apart < 50
+        around = [angle_between_views(views[i], views[target]) for i in (left, right)]
+        assert min(around) > 5
+        assert sum(around) < apart + 10
+    with pytest.raises(DyngsError, match=r"use model\.training_views=any"):
+        network_trainer(field_config("keypoint_nerf", folder, tmp_path, ALTERNATIVES))
+
+
 def test_a_prediction_is_a_run(
     run: Path, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Drawn and measured like any other; not trained, and no Gaussians."""
-    made = predict(run, read_captured_person(folder), tmp_path / "three", 3)
+    made = predict(run, second_person(folder), tmp_path / "three", 3)
     found = load_run(made.run_dir)
     assert isinstance(found.renderable, PredictedField)
     assert (found.config.model.kind, found.step, found.config.data.root) == (
         "predicted_field",
         0,
-        read_captured_person(folder),
+        second_person(folder),
     )
     assert (made.steps, made.num_gaussians, len(made.views)) == (0, 0, 3)
-    again = predict(run, read_captured_person(folder), tmp_path / "again", made.views)
+    again = predict(run, second_person(folder), tmp_path / "again", made.views)
     state = load_run(again.run_dir).renderable.state()
     assert all(
         torch.equal(x.tensor, state[name].tensor) for name, x in found.renderable.state().items()
@@ -88,12 +136,12 @@ def test_a_prediction_is_a_run(
         capsys, "train", "--resume", str(made.run_dir)
     )
     assert "cannot be trained" in error_line(
-        capsys, "train", f"data.root={read_captured_person(folder)}", "model.kind=predicted_field"
+        capsys, "train", f"data.root={second_person(folder)}", "model.kind=predicted_field"
     )
 
 
 def test_unsuitable_prediction_inputs_are_refused(run: Path, folder: Path, tmp_path: Path) -> None:
-    person = read_captured_person(folder)
+    person = second_person(folder)
     out = tmp_path / "out"
     with pytest.raises(DyngsError, match="p000001: needs at least two views of one time step"):
         predict(run, person, out, 1)
@@ -137,7 +185,7 @@ def test_a_body_is_fitted_where_none_is_given(
         "dyngs.human.predict.fields.prediction.ensure_fitted_body",
         lambda data, **_: (asked.append(data.root), data)[1],
     )
-    person = Path(shutil.copytree(read_captured_person(folder), tmp_path / "bare"))
+    person = Path(shutil.copytree(second_person(folder), tmp_path / "bare"))
     (person / "body_train.npz").unlink()
     with pytest.raises(DyngsError, match="bare: no body parameters"):
         predict(run, person, tmp_path / "out", 2)
@@ -146,7 +194,7 @@ def test_a_body_is_fitted_where_none_is_given(
 
 
 def test_somebody_must_be_seen_from_three_sides(folder: Path, tmp_path: Path) -> None:
-    person = Path(shutil.copytree(read_captured_person(folder), tmp_path / "set" / "ann"))
+    person = Path(shutil.copytree(second_person(folder), tmp_path / "set" / "ann"))
     file = person / "transforms_train.json"
     document = json.loads(file.read_text())
     file.write_text(json.dumps(document | {"frames": document["frames"][:2]}))
