@@ -86,6 +86,11 @@ class HumanPredictorModel(_OnTemplate):
         description="largest number of input images per person; every other training example has "
         "fewer",
     )
+    unseen_colours: Literal["mixture", "inpainted"] = Field(
+        default="mixture",
+        description="colours of texels that no image shows; mixture: of the mean person, texels "
+        "nearby and the mirrored side, inpainted: by gated convolutions on the UV map (GHG)",
+    )
     lr: Positive = Field(
         default=2e-3, description="peak learning rate of AdamW (one-cycle schedule)"
     )

@@ -20,12 +20,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return people(tmp_path_factory.mktemp("people"), (1, 2))
 
 
-def test_a_resumed_run_ends_with_the_same_bytes(folder: Path, tmp_path: Path) -> None:
-    middle, last = checkpoint_paths(train(config(folder, tmp_path / "whole")))
-    resumed = train(
-        config(folder, tmp_path / "parts"),
-        resume_from=stopped(config(folder, tmp_path / "parts"), 2),
-    )
+@pytest.mark.parametrize("unseen_colours", ["mixture", "inpainted"])
+def test_a_resumed_run_ends_with_the_same_bytes(
+    folder: Path, tmp_path: Path, unseen_colours: str
+) -> None:
+    whole = config(folder, tmp_path / "whole", unseen_colours=unseen_colours)
+    middle, last = checkpoint_paths(train(whole))
+    parts = config(folder, tmp_path / "parts", unseen_colours=unseen_colours)
+    resumed = train(parts, resume_from=stopped(parts, 2))
     assert checkpoint_paths(resumed)[-1].read_bytes() == last.read_bytes()
     before, after = (load_checkpoint(path).part("model.network") for path in (middle, last))
     assert any(not torch.equal(before[name], after[name]) for name in before)

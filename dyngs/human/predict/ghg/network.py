@@ -19,7 +19,7 @@ import torch
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import KDTree
 from torch import Tensor, nn
-from torch.nn.functional import max_pool2d, pad
+from torch.nn.functional import elu, max_pool2d, pad
 
 from dyngs.config import Config, DataConfig
 from dyngs.config.io import load_config, packaged_preset
@@ -345,6 +345,50 @@ HEADS = {
 """Output channels per texel of a scaffold, see ``predict_avatar``."""
 
 
+class GatedConv(nn.Conv2d):
+    """Gated convolution (Yu et al. 2019): ELU of some channels times the sigmoid of as many.
+
+    Twice the sigmoid, which is about 1 before training, so that deep features do not vanish.
+    """
+
+    def __init__(self, before: int, width: int, stride: int = 1, dilation: int = 1) -> None:
+        super().__init__(before, 2 * width, 3, stride, dilation, dilation)
+
+    def forward(self, input: Tensor) -> Tensor:
+        values, gates = super().forward(input).chunk(2, dim=1)
+        return elu(values) * (2 * gates.sigmoid())
+
+
+class Inpainting(nn.Module):
+    """Fills holes in the colours of the lowest scaffold by gated convolutions, as GHG does.
+
+    One stage, without the discriminator: it is trained with the rest on the rendered images.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layers = nn.ModuleList(
+            [
+                GatedConv(5, 24),
+                GatedConv(24, 48, stride=2),
+                GatedConv(48, 64, stride=2),
+                *(GatedConv(64, 64, dilation=2**i) for i in range(1, 4)),
+                GatedConv(64, 48),
+                GatedConv(48, 24),
+            ]
+        )
+        self.last = nn.Conv2d(24, 3, 3, padding=1)
+
+    def forward(self, rgb: Tensor, hole: Tensor, texels: Tensor) -> Tensor:
+        """Return ``rgb`` (3, S, S) with its ``hole`` (1, S, S) filled; ``texels`` (1, S, S) are 1
+        on the skin."""
+        known = rgb * (1 - hole)
+        features = torch.cat([known, hole, texels])[None]
+        for i, layer in enumerate(self.layers):
+            features = layer(features if i < len(self.layers) - 2 else upsample(features))
+        return known + hole * self.last(features)[0].sigmoid()
+
+
 class AtlasNetwork(Encoder):
     """U-Net from maps (D, S, S) to raw predictions (K, 16, S, S) in the order of ``HEADS``.
 
@@ -352,9 +396,11 @@ class AtlasNetwork(Encoder):
     the input.
     """
 
-    def __init__(self, channels: int, scaffolds: int, generator: torch.Generator) -> None:
+    def __init__(
+        self, channels: int, scaffolds: int, generator: torch.Generator, inpaints: bool = False
+    ) -> None:
         """Create the network on the CPU for D ``channels`` and K ``scaffolds``, with weights from
-        ``generator``."""
+        ``generator``; with one that ``inpaints``."""
         with torch.device("cpu"):
             super().__init__(channels, WIDTHS)
             self.scaffolds = scaffolds
@@ -366,6 +412,7 @@ class AtlasNetwork(Encoder):
                 nn.Conv2d(WIDTHS[0] + channels, WIDTHS[0], 3, padding=1), nn.SiLU()
             )
             self.heads = nn.Conv2d(WIDTHS[0], scaffolds * sum(HEADS.values()), 1)
+            self.inpainting = Inpainting() if inpaints else None
         initialize_weights(self, generator)
         nn.init.zeros_(self.heads.weight)
 
@@ -423,6 +470,21 @@ def guess_unseen_colours(person: AtlasPerson, maps: TexelMaps, mean: Tensor) -> 
     return torch.stack([from_atlas(mean, person.texels), maps.nearby, mirrored])
 
 
+def inpaint_colours(
+    person: AtlasPerson, maps: TexelMaps, network: Inpainting
+) -> tuple[Tensor, Tensor]:
+    """Return the colours (P, 3) of the lowest scaffold with its hole filled, and the texels (P,)
+    beside the hole.
+
+    The hole are the unobserved texels, dilated by 5 x 5.
+    """
+    seen = (maps.seen[:1] > 0).to(maps.rgb).T
+    texels = to_atlas(torch.ones_like(seen), person.texels)
+    hole = texels * max_pool2d(texels - to_atlas(seen, person.texels), 5, 1, 2)
+    painted = network(to_atlas(maps.rgb[0], person.texels), hole, texels)
+    return from_atlas(painted, person.texels), from_atlas(hole, person.texels)[:, 0] == 0
+
+
 def predict_avatar(
     person: AtlasPerson, maps: TexelMaps, mean: Tensor, network: AtlasNetwork
 ) -> HumanScene:
@@ -431,8 +493,8 @@ def predict_avatar(
     The lowest scaffold gets a Gaussian per texel, upper ones only where a view observes the texel
     and ``SILHOUETTE_FRACTION`` of the silhouettes contain it. Rotations are relative to the
     tangent frame, scales to the initial Gaussian, means move along the normal. Colours blend those
-    of the images with a mixture of ``guess_unseen_colours`` plus a correction; ``mean`` (3, S, S)
-    is as there.
+    of the images with a guess plus a correction: a mixture of ``guess_unseen_colours``, or the
+    colours of ``inpaint_colours``. ``mean`` (3, S, S) is as in the former.
     """
     kept = (maps.inside >= SILHOUETTE_FRACTION) & (maps.seen > 0)
     kept[0] = True
@@ -445,10 +507,15 @@ def predict_avatar(
     raw = torch.cat([from_atlas(level, person.texels) for level in raw]).index_select(0, rows)
     part = dict(zip(HEADS, raw.split(tuple(HEADS.values()), dim=1), strict=True))
     weight = (part["image_weight"] + _IMAGE_LOGIT).sigmoid()
-    weight = weight * (maps.seen.flatten()[rows, None] > 0)
-    fractions = (part["guess"] + part["guess"].new_tensor(_GUESS_LOGITS)).softmax(dim=1)
-    guess = (fractions.T[..., None] * guesses[:, texel]).sum(0) + part["colour"]
-    rgb = weight * maps.rgb.flatten(0, 1)[rows] + (1 - weight) * guess
+    is_seen = maps.seen > 0
+    if network.inpainting is None:
+        fractions = (part["guess"] + part["guess"].new_tensor(_GUESS_LOGITS)).softmax(dim=1)
+        guess = (fractions.T[..., None] * guesses[:, texel]).sum(0)
+    else:
+        painted, is_seen[0] = inpaint_colours(person, maps, network.inpainting)
+        guess = painted[texel]
+    weight = weight * is_seen.flatten()[rows, None]
+    rgb = weight * maps.rgb.flatten(0, 1)[rows] + (1 - weight) * (guess + part["colour"])
     one = rgb.new_tensor([1.0, 0.0, 0.0, 0.0])
     limit = min((0.5 * (b - a) for a, b in pairwise(person.heights)), default=_MAX_HEIGHT)
     gaussians = Gaussians(
@@ -636,7 +703,8 @@ def new_network(model: HumanPredictorModel, generator: torch.Generator) -> Atlas
     if model.resolution % factor:
         raise DyngsError(f"model.resolution={model.resolution} must be a multiple of {factor}")
     scaffolds = len(set(model.scaffold_heights))
-    return AtlasNetwork(num_input_channels(scaffolds), scaffolds, generator)
+    inpaints = model.unseen_colours == "inpainted"
+    return AtlasNetwork(num_input_channels(scaffolds), scaffolds, generator, inpaints)
 
 
 def load_network(network: AtlasNetwork, checkpoint: Checkpoint, resolution: int) -> Tensor:

@@ -50,7 +50,7 @@ def test_a_resumed_run_ends_with_the_same_bytes(run: Path, folder: Path, tmp_pat
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_training_lowers_the_error(folder: Path, tmp_path: Path, kind: str) -> None:
-    """On the same examples: 0.93 and 0.966 of it are left."""
+    """On the same examples: 0.77 and 0.70 of it are left."""
     trainer = network_trainer(field_config(kind, folder, tmp_path / "run", steps=40))
 
     @torch.no_grad()
@@ -59,9 +59,9 @@ def test_training_lowers_the_error(folder: Path, tmp_path: Path, kind: str) -> N
         return sum(float(trainer.learner.example(0, 1, draw).loss) for draw in draws)
 
     before = error()
-    for _ in range(20):
+    for _ in range(30):
         trainer.step()
-    assert error() < 0.985 * before
+    assert error() < 0.9 * before
 
 
 ALTERNATIVES = {"training_views": "between", "patch": 12, "supersampling": 2}

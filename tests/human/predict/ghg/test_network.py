@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
+from scipy.ndimage import binary_dilation
 from tiny_people import NET, people, person
 from torch import Tensor
 
@@ -15,8 +17,10 @@ from dyngs.human.predict.ghg.network import (
     HEADS,
     AtlasNetwork,
     AtlasPerson,
+    GatedConv,
     TexelMaps,
     guess_unseen_colours,
+    inpaint_colours,
     network_inputs,
     num_input_channels,
     predict_avatar,
@@ -113,6 +117,53 @@ def test_unseen_texels_are_painted_and_mistrusted_ones_too(shown: Shown) -> None
     torch.testing.assert_close(trusting[~seen], guess[~seen] + 0.5)
     wary = predicted(shown, {"colour": 0.5, "image_weight": -50.0}).gaussians.base_rgb
     torch.testing.assert_close(wary[: len(sitter.texels)], guess + 0.5)
+
+
+def test_inpainting_fills_the_dilated_hole_alone(shown: Shown) -> None:
+    """Against a dilation in SciPy; texels beside the hole keep the colours of the images."""
+    sitter, maps = shown
+    made = AtlasNetwork(num_input_channels(2), 2, torch.Generator().manual_seed(0), inpaints=True)
+    plain = constant_network().state_dict()
+    own = made.state_dict()
+    assert all(torch.equal(own[name], x) for name, x in plain.items() if name[0] != "h")
+    assert made.inpainting is not None
+    with torch.no_grad():
+        avatar = predict_avatar(*shown, MEAN, made)
+        painted, beside = inpaint_colours(sitter, maps, made.inpainting)
+    size = NET.resolution
+    unseen = np.zeros(size * size, dtype=bool)
+    unseen[sitter.texels.index.numpy()] = (maps.seen[0] == 0).numpy()
+    hole = binary_dilation(unseen.reshape(size, size), np.ones((5, 5)))
+    expected = hole.ravel()[sitter.texels.index.numpy()]
+    assert 0.1 < expected.mean() < 0.9
+    assert np.array_equal(beside.numpy(), ~expected)
+    torch.testing.assert_close(painted[beside], maps.rgb[0][beside])
+    rgb = avatar.gaussians.base_rgb[: len(sitter.texels)]
+    torch.testing.assert_close(rgb, painted, atol=1e-5, rtol=0)
+    assert float((painted[~beside] - 0.5).abs().mean()) > 0.01
+    colours = replace(maps, rgb=torch.where(maps.seen[..., None] > 0, maps.rgb, 7.0))
+    with torch.no_grad():
+        again, _ = inpaint_colours(sitter, colours, made.inpainting)
+    torch.testing.assert_close(again, painted)  # colours in the hole are not read
+
+
+def test_a_gated_convolution_is_elu_times_twice_the_sigmoid() -> None:
+    layer = GatedConv(2, 3, stride=2, dilation=2).double()
+    images = torch.randn(1, 2, 8, 8, dtype=torch.float64, requires_grad=True)
+    plain = torch.nn.functional.conv2d(images, layer.weight, layer.bias, 2, 2, 2)
+    value, gate = plain[:, :3], plain[:, 3:]
+    expected = torch.where(value > 0, value, value.exp() - 1) * 2 / (1 + (-gate).exp())
+    torch.testing.assert_close(layer(images), expected)
+    assert torch.autograd.gradcheck(layer, images)
+
+
+def test_inpainting_learns(shown: Shown) -> None:
+    made = AtlasNetwork(num_input_channels(2), 2, torch.Generator().manual_seed(0), inpaints=True)
+    assert made.inpainting is not None
+    predict_avatar(*shown, MEAN, made).gaussians.base_rgb.square().sum().backward()
+    for name, parameter in made.inpainting.named_parameters():
+        assert parameter.grad is not None, name
+        assert bool(parameter.grad.any()), name
 
 
 def test_all_heads_learn(shown: Shown) -> None:
