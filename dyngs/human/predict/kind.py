@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import TYPE_CHECKING
 
+from dyngs.core.section import ModelSection
 from dyngs.human.keys import HumanPredictorModel
 from dyngs.human.predict.keys import (
     EgHumanNerfModel,
-    FieldPredictorModel,
     GpsModel,
     KeypointNerfModel,
     PredictedFieldModel,
@@ -19,46 +20,19 @@ if TYPE_CHECKING:
     from dyngs.models.kind import MakeLearner, MakePredictor, Restore, Start
 
 
-class HumanPredictorKind(PredictsScenes):
-    """Predicts avatars on a body template (GHG)."""
+class PersonPredictorKind(PredictsScenes):
+    """Predicts people by the network of a ``module`` of this package."""
 
-    def num_views(self, section: HumanPredictorModel) -> int:
-        return section.source_views
+    def __init__(self, section: type[ModelSection], module: str) -> None:
+        super().__init__(section)
+        self._module = module
 
-    def networks(self) -> tuple[MakeLearner, MakePredictor]:
-        from dyngs.human.predict.ghg.network import learner, predictor
-
-        return learner, predictor
-
-
-HUMAN_PREDICTOR = HumanPredictorKind(HumanPredictorModel)
-
-
-class GpsKind(PredictsScenes):
-    """Predicts Gaussians from pairs of views (GPS-Gaussian)."""
-
-    def num_views(self, section: GpsModel) -> int:
-        return 2
+    def num_views(self, section: ModelSection) -> int:
+        return getattr(section, "source_views", 2)
 
     def networks(self) -> tuple[MakeLearner, MakePredictor]:
-        from dyngs.human.predict.gps.stereo import learner, predictor
-
-        return learner, predictor
-
-
-GPS = GpsKind(GpsModel)
-
-
-class FieldPredictorKind(PredictsScenes):
-    """Predicts radiance fields (KeypointNeRF, EG-HumanNeRF)."""
-
-    def num_views(self, section: FieldPredictorModel) -> int:
-        return section.source_views
-
-    def networks(self) -> tuple[MakeLearner, MakePredictor]:
-        from dyngs.human.predict.fields.prediction import learner, predictor
-
-        return learner, predictor
+        module = import_module(f"dyngs.human.predict.{self._module}")
+        return module.learner, module.predictor
 
 
 class PredictedFieldKind(ModelKind):
@@ -73,6 +47,8 @@ class PredictedFieldKind(ModelKind):
         return PredictedModel, restore
 
 
-KEYPOINT_NERF = FieldPredictorKind(KeypointNerfModel)
-EG_HUMAN_NERF = FieldPredictorKind(EgHumanNerfModel)
+HUMAN_PREDICTOR = PersonPredictorKind(HumanPredictorModel, "ghg.network")  # GHG
+GPS = PersonPredictorKind(GpsModel, "gps.stereo")  # GPS-Gaussian, from pairs of views
+KEYPOINT_NERF = PersonPredictorKind(KeypointNerfModel, "fields.prediction")
+EG_HUMAN_NERF = PersonPredictorKind(EgHumanNerfModel, "fields.prediction")
 PREDICTED_FIELD = PredictedFieldKind(PredictedFieldModel)

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from scipy.spatial import KDTree
 from torch import Tensor
-from torch.nn.functional import grid_sample
+from torch.nn.functional import grid_sample, pad
 
 from dyngs.config import DataConfig
 from dyngs.core.camera import Cameras
@@ -64,17 +64,10 @@ class Sources:
         return len(self.rgba)
 
     @property
-    def centers(self) -> Tensor:
-        """Camera centres (V, 3), m."""
-        rotation = self.cam_from_world[:, :3, :3]
-        translation = self.cam_from_world[:, :3, 3]
-        return -(rotation * translation[..., None]).sum(1)
-
-    def camera(self, index: int) -> Cameras:
+    def cameras(self) -> Cameras:
+        """The V cameras, in metres."""
         height, width = self.rgba.shape[2:]
-        return Cameras(
-            self.cam_from_world[index][None], self.intrinsics[index][None], width, height
-        )
+        return Cameras(self.cam_from_world, self.intrinsics, width, height)
 
 
 @dataclass(frozen=True)
@@ -165,18 +158,16 @@ def crop_source_images(images: Sequence[Image], scale: float) -> Sources:
         -(-max(getattr(crop.cameras, side) for crop in crops) // MULTIPLE) * MULTIPLE
         for side in ("height", "width")
     )
-    rgba = torch.zeros((len(crops), 4, height, width), device=crops[0].rgb_premultiplied.device)
-    for target, crop in zip(rgba, crops, strict=True):
+    rgba = []
+    for crop in crops:
         assert crop.alpha is not None
-        rows, columns = crop.alpha.shape
-        target[:3, :rows, :columns] = crop.rgb_premultiplied.permute(2, 0, 1)
-        target[3, :rows, :columns] = crop.alpha
+        planes = torch.cat([crop.rgb_premultiplied, crop.alpha[..., None]], -1).permute(2, 0, 1)
+        rgba.append(pad(planes, (0, width - planes.shape[2], 0, height - planes.shape[1])))
     cameras = [cameras_in_metres(crop.cameras, scale) for crop in crops]
     poses, intrinsics = (
-        torch.cat([getattr(x, name) for x in cameras]).to(rgba)
-        for name in ("cam_from_world", "intrinsics")
+        torch.cat([getattr(x, name) for x in cameras]) for name in ("cam_from_world", "intrinsics")
     )
-    return Sources(rgba, poses, intrinsics)
+    return Sources(torch.stack(rgba), poses, intrinsics)
 
 
 def crop_window(image: Image, left: int, top: int, side: int) -> Image:
@@ -209,16 +200,15 @@ class BodyBoundaries:
         # Heights at the centres of a grid of cells, whose values end at ``reach``.
         reach = DILATION + _CELL
         low = vertices.min(axis=0) - reach
-        cells = np.ceil((vertices.max(axis=0) + reach - low) / _CELL).astype(int)
-        axes = [low[i] + (np.arange(cells[i]) + 0.5) * _CELL for i in range(3)]
-        centres = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+        size = np.ceil((vertices.max(axis=0) + reach - low) / _CELL)
+        centres = low + _CELL * (np.moveaxis(np.indices(size.astype(int)), 0, -1) + 0.5)
         distance, nearest = KDTree(vertices).query(centres, distance_upper_bound=reach)
         nearest = np.minimum(nearest, len(vertices) - 1)
         is_inside = ((centres - vertices[nearest]) * normals[nearest]).sum(-1) < 0
         height = np.minimum(distance, reach) * np.where(is_inside & (distance < reach), -1, 1)
         self._heights = torch.from_numpy(height).to(self._body)[None, None]
         self._low = torch.from_numpy(low).to(self._body)
-        self._size = torch.from_numpy(_CELL * cells).to(self._body)
+        self._size = torch.from_numpy(_CELL * size).to(self._body)
 
     def height(self, points: Tensor) -> Tensor:
         """Return the signed distance (N,) of points (N, 3) to the nearest vertex, m; negative

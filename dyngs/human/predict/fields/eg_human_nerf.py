@@ -93,8 +93,7 @@ class EgHumanNerf(FieldNetwork):
 
     def prepare(self, features: SourceFeatures, body: PosedBody) -> Tensor:
         """Return the depth maps (V, 1, H, W) of the body in the images, m."""
-        sources = features.sources
-        depths = [body.boundaries.depth(sources.camera(i)) for i in range(len(sources))]
+        depths = [body.boundaries.depth(camera) for camera in features.sources.cameras]
         return torch.stack(depths)[:, None].clamp(max=_FAR)
 
     def limits(self, person: EncodedPerson, camera: Cameras, z: Tensor) -> tuple[Tensor, Tensor]:
@@ -161,7 +160,7 @@ class EgHumanNerf(FieldNetwork):
             hidden = behind.clamp(0, 2)
             excluded = torch.zeros_like(hidden)
         directions = rays.directions.repeat_interleave(near.shape[1], 0)
-        relative = relative_directions(directions, points, features.sources.centers)
+        relative = relative_directions(directions, points, features.sources.cameras.centers)
         facts = torch.cat([hidden[..., None].to(relative), relative], -1)
         logits = self.attention(torch.cat([seen.features, facts], -1))[..., 0]
         weights = (logits - excluded).softmax(0)
@@ -173,8 +172,8 @@ class EgHumanNerf(FieldNetwork):
         colours = self.blend_images(seen, shared, [seen.colours, facts], excluded)
 
         opacity = opacities(near, closer, self.sharpness.exp(), self.keys.density)
-        through = torch.cumprod(torch.cat([torch.ones_like(opacity[:, :1]), 1 - opacity], 1), 1)
-        weights = opacity * through[:, :-1]
+        through = pad((1 - opacity).cumprod(1), (1, 0), value=1.0)
+        weights = -through.diff(dim=1)
         colour = (weights[..., None] * colours.view(*near.shape, 3)).sum(1)
         distance = (weights * near).sum(1, keepdim=True)
         return torch.cat([colour, through[:, -1:], distance], 1), [(at, signed), (near, closer)]
@@ -187,22 +186,19 @@ class EgHumanNerf(FieldNetwork):
         total = picture.colour.new_zeros(())
         assert image.depth is not None
         assert image.alpha is not None
-        _, z = camera_rays(self.finer(image.cameras))
-        count = self.keys.supersampling
-        depth, alpha = (
-            x.repeat_interleave(count, 0).repeat_interleave(count, 1).flatten()
-            for x in (image.depth, image.alpha)
-        )
+        _, z = camera_rays(image.cameras.scaled(self.keys.supersampling))
+        maps = torch.stack([image.depth, image.alpha])[None]
+        depth, alpha = interpolate(maps, scale_factor=self.keys.supersampling)[0].flatten(1)
+        surface = (depth / (scale * z))[:, None]
+        misses = alpha[:, None] < _EDGE
+        is_known = misses | ((alpha[:, None] > 1 - _EDGE) & (surface > 0))
         limit = PARAMS.limit
         for rays, at, signed in picture.samples:
-            surface = (depth[rays] / (scale * z[rays]))[:, None]
-            deviation = (signed - (surface - at).clamp(-limit, limit)).abs()
+            deviation = (signed - (surface[rays] - at).clamp(-limit, limit)).abs()
             # Rays that miss have no true distance; only values below a small margin are penalised.
-            misses = alpha[rays, None] < _EDGE
-            error = torch.where(misses, (PARAMS.clear - signed).relu(), deviation)
-            is_known = misses | ((alpha[rays, None] > 1 - _EDGE) & (surface > 0))
-            error = torch.where(is_known, error, 0.0)
-            total = total + error.sum() / (limit * at.shape[1] * is_known.sum().clamp_min(1))
+            error = torch.where(misses[rays], (PARAMS.clear - signed).relu(), deviation)
+            known = is_known[rays]
+            total = total + (known * error).sum() / (limit * at.shape[1] * known.sum().clamp_min(1))
         return PARAMS.srdf_weight * total
 
 
@@ -214,10 +210,8 @@ def expected_surface(at: Tensor, signed: Tensor) -> Tensor:
     """
     crosses = (signed[:, :-1] > 0) & (signed[:, 1:] <= 0)
     index = crosses.to(torch.uint8).argmax(1, keepdim=True)
-    before = signed.gather(1, index)
-    after = signed.gather(1, index + 1)
-    low = at.gather(1, index)
-    high = at.gather(1, index + 1)
+    before, after = (signed.gather(1, index + i) for i in (0, 1))
+    low, high = (at.gather(1, index + i) for i in (0, 1))
     fraction = before / (before - after).clamp_min(1e-9)
     smallest = at.gather(1, signed.argmin(1, keepdim=True))
     smallest = torch.where(signed[:, :1] <= 0, at[:, :1], smallest)
@@ -241,8 +235,8 @@ def opacities(at: Tensor, signed: Tensor, sharpness: Tensor, form: str = "neus")
     alpha Psi(-s) with the Laplace distribution function Psi of scale beta (Yariv et al. 2021;
     alpha = 1 / beta = ``sharpness``, per m).
     """
-    gaps = at.diff(dim=1)
-    half = (torch.cat([gaps[:, :1], gaps], 1) + torch.cat([gaps, gaps[:, -1:]], 1)) / 4
+    gaps = pad(at.diff(dim=1), (1, 1), mode="replicate")
+    half = (gaps[:, :-1] + gaps[:, 1:]) / 4
     if form == "laplace":
         tail = (-sharpness * signed.abs()).exp() / 2
         density = sharpness * torch.where(signed > 0, tail, 1 - tail)
@@ -282,8 +276,6 @@ class Refinement(nn.Module):
         output = levels.pop()
         for layer in self.up:
             larger = levels.pop()
-            output = layer(
-                torch.cat([interpolate(output, larger.shape[2:], mode="nearest"), larger], 1)
-            ).relu()
+            output = layer(torch.cat([interpolate(output, larger.shape[2:]), larger], 1)).relu()
         change = self.last(output)[0, :, :height, :width].permute(1, 2, 0)
         return (colour + alpha[..., None] * change).clamp_min(0)

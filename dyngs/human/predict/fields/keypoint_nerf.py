@@ -17,9 +17,8 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn.functional import grid_sample, max_pool2d, softplus
+from torch.nn.functional import max_pool2d, softplus
 
-from dyngs.core.camera import Cameras
 from dyngs.human.body.joints import JOINT_PARENTS
 from dyngs.human.predict.fields.network import (
     FINE,
@@ -32,12 +31,13 @@ from dyngs.human.predict.fields.network import (
     initialize_network,
     mean_and_variance,
     relative_directions,
+    sample_maps,
     sample_offsets,
 )
 from dyngs.human.predict.keys import EgHumanNerfKeys
 from dyngs.human.predict.people import NUM_KEY_POINTS, PosedBody, Sources
 from dyngs.models.volume import reached_samples, select_samples, thin_samples
-from dyngs.ops.rays import MarchSteps, Rays, Samples, Space, composite, march
+from dyngs.ops.rays import MarchSteps, Rays, Space, composite, march
 
 
 @dataclass(frozen=True)
@@ -79,9 +79,6 @@ class KeypointNerf(FieldNetwork):
     def prepare(self, features: SourceFeatures, body: PosedBody) -> tuple[Space, Tensor]:
         return visual_hull(features, body.key_points)
 
-    def limits(self, person: EncodedPerson, camera: Cameras, z: Tensor) -> tuple[Tensor, Tensor]:
-        return torch.arange(len(z), device=z.device), z[:, None]
-
     def march(
         self, person: EncodedPerson, rays: Rays, limits: Tensor, generator: torch.Generator | None
     ) -> tuple[Tensor, Sequence[Any]]:
@@ -91,9 +88,9 @@ class KeypointNerf(FieldNetwork):
         samples = march(rays, shifts, space, occupied, MarchSteps(NEAR, PARAMS.step))
         is_training = torch.is_grad_enabled()
         with torch.no_grad():  # densities alone decide which samples are rendered
-            alpha = features.alpha(sample_positions(samples, space)) > PARAMS.visible
+            alpha = features.alpha(to_world(samples.coords, space)) > PARAMS.visible
             samples = select_samples(samples, alpha.all(0))[0]
-            points = sample_positions(samples, space)
+            points = to_world(samples.coords, space)
             code = spatial_code(points, person.body.key_points, features.sources)
             seen = features.sample(points)
             geometry = self._geometry(person, points, code, seen)
@@ -110,7 +107,7 @@ class KeypointNerf(FieldNetwork):
             [seen.colours, geometry[:, 1:].expand(len(features.sources), -1, -1)], -1
         )
         directions = rays.directions[samples.rays.long()]
-        directions = relative_directions(directions, points, features.sources.centers)
+        directions = relative_directions(directions, points, features.sources.cameras.centers)
         colours = self.blend_images(seen, mean_and_variance(per_view), [per_view, directions])
         image = composite(density(geometry), colours, samples)
         return torch.cat([image.colour, image.transmittance[:, None], image.depth[:, None]], 1), []
@@ -166,22 +163,18 @@ def visual_hull(features: SourceFeatures, key_points: Tensor) -> tuple[Space, Te
     half = float((high - low).max()) / 2 + AROUND
     x, y, z = ((low + high) / 2).tolist()
     space = Space((x, y, z), half, 1, PARAMS.cells)
-    axis = (torch.arange(PARAMS.cells, device=low.device) + 0.5) * (2 * half / PARAMS.cells) - half
-    z, y, x = torch.meshgrid(*(axis + middle for middle in reversed(space.centre)), indexing="ij")
-    middles = torch.stack([x, y, z], -1).view(-1, 3)
+    axis = (torch.arange(PARAMS.cells, device=low.device) + 0.5) / PARAMS.cells
+    z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
+    middles = to_world(torch.stack([x, y, z], -1).view(-1, 3), space)
     grid, depth = features.project(middles)
     sources = features.sources
     reach = half / PARAMS.cells * math.sqrt(3)
-    occupied = torch.ones(len(middles), dtype=torch.bool, device=low.device)
-    for i in range(len(sources)):
-        nearest = max(float(depth[i].min()), NEAR)
-        # size of a cell in the image
-        pixels = math.ceil(reach * float(sources.intrinsics[i, 0, 0]) / nearest) + 1
-        alpha = max_pool2d(sources.rgba[i : i + 1, 3:], (2 * pixels + 1, 1), 1, (pixels, 0))
-        alpha = max_pool2d(alpha, (1, 2 * pixels + 1), 1, (0, pixels))
-        grid_i = grid[i][None, None]
-        cell_alpha = grid_sample(alpha, grid_i, mode="nearest", align_corners=False)[0, 0, 0]
-        occupied &= cell_alpha > PARAMS.visible
+    nearest = depth.amin(1).clamp_min(NEAR)
+    # largest size of a cell in an image
+    pixels = math.ceil(reach * float((sources.intrinsics[:, 0, 0] / nearest).max())) + 1
+    alpha = max_pool2d(sources.rgba[:, 3:], (2 * pixels + 1, 1), 1, (pixels, 0))
+    alpha = max_pool2d(alpha, (1, 2 * pixels + 1), 1, (0, pixels))
+    occupied = (sample_maps(alpha, grid, "nearest")[..., 0] > PARAMS.visible).all(0)
     where = occupied.nonzero()[:, 0]
     occupied[where] = distance_to_bones(middles[where], key_points) < AROUND
     return space, occupied.view(space.shape)
@@ -189,15 +182,13 @@ def visual_hull(features: SourceFeatures, key_points: Tensor) -> tuple[Space, Te
 
 def distance_to_bones(points: Tensor, key_points: Tensor) -> Tensor:
     """Return the distances (M,) of points (M, 3) to the nearest bone of key points (J, 3), m."""
-    nearest = (points - key_points[0]).norm(dim=1)
-    for joint, parent in enumerate(JOINT_PARENTS[1 : len(key_points)], start=1):
-        start = key_points[parent]
-        along = key_points[joint] - key_points[parent]
-        at = ((points - start) @ along / along.square().sum().clamp_min(1e-12)).clamp(0, 1)
-        nearest = torch.minimum(nearest, (points - start - at[:, None] * along).norm(dim=1))
-    return nearest
+    starts = key_points[list(JOINT_PARENTS[1 : len(key_points)])]
+    bones = key_points[1:] - starts
+    offsets = points[:, None] - starts
+    at = (offsets * bones).sum(-1) / bones.square().sum(-1).clamp_min(1e-12)
+    return (offsets - at.clamp(0, 1)[..., None] * bones).norm(dim=-1).amin(1)
 
 
-def sample_positions(samples: Samples, space: Space) -> Tensor:
-    """Return the centres (M, 3) of samples."""
-    return (samples.coords - 0.5) * (2 * space.half) + samples.coords.new_tensor(space.centre)
+def to_world(coords: Tensor, space: Space) -> Tensor:
+    """Return positions (M, 3) of coordinates (M, 3) in the unit cube."""
+    return (coords - 0.5) * (2 * space.half) + coords.new_tensor(space.centre)

@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import grid_sample
+from torch.nn.functional import grid_sample, normalize
 
 from dyngs.core.camera import Cameras
 from dyngs.core.initialisation import glorot
@@ -154,14 +154,9 @@ def relative_directions(directions: Tensor, points: Tensor, centers: Tensor) -> 
     The normalised difference and the dot product of ray directions (M, 3) and directions from
     camera ``centers`` (V, 3) to ``points`` (M, 3).
     """
-    source_directions = torch.nn.functional.normalize(points - centers[:, None], dim=-1)
-    difference = torch.nn.functional.normalize(directions - source_directions, dim=-1)
+    source_directions = normalize(points - centers[:, None], dim=-1)
+    difference = normalize(directions - source_directions, dim=-1)
     return torch.cat([difference, (directions * source_directions).sum(-1, keepdim=True)], -1)
-
-
-def split_rays(rays: Tensor) -> Sequence[Tensor]:
-    """Split ray indices into chunks that are rendered together; a single one in training."""
-    return [rays] if torch.is_grad_enabled() else rays.split(CHUNK)
 
 
 def sample_offsets(*shape: int, generator: torch.Generator | None) -> Tensor:
@@ -214,12 +209,12 @@ class FieldNetwork(nn.Module, ABC):
     def prepare(self, features: SourceFeatures, body: PosedBody) -> Any:
         """Return ``EncodedPerson.extra``."""
 
-    @abstractmethod
     def limits(self, person: EncodedPerson, camera: Cameras, z: Tensor) -> tuple[Tensor, Tensor]:
         """Return the indices (R,) of rays that may hit the person, and values (P, D) of all rays.
 
         ``z`` (P,) is the depth at distance 1 along each ray of the camera.
         """
+        return torch.arange(len(z), device=z.device), z[:, None]
 
     @abstractmethod
     def march(
@@ -239,29 +234,17 @@ class FieldNetwork(nn.Module, ABC):
         ``generator`` places samples at random, as in training; None: evenly.
         """
         count = self.keys.supersampling
-        finer = self.finer(camera)
+        finer = camera.scaled(count)
         rays, z = camera_rays(finer)
         rows, limits = self.limits(person, finer, z)
-        found = [
-            self.march(person, rays[piece], limits[piece], generator) for piece in split_rays(rows)
-        ]
+        pieces = [rows] if torch.is_grad_enabled() else rows.split(CHUNK)
+        found = [self.march(person, rays[piece], limits[piece], generator) for piece in pieces]
         canvas = z.new_tensor([0.0, 0.0, 0.0, 1.0, 0.0]).repeat(len(z), 1)
         canvas = canvas.index_copy(0, rows, torch.cat([values for values, _ in found]))
         canvas = canvas.view(camera.height, count, camera.width, count, 5).mean((1, 3))
         samples = [(rows, *pair) for pair in found[0][1]] if torch.is_grad_enabled() else []
         picture = FieldPicture(canvas[..., :3], canvas[..., 3], canvas[..., 4], samples)
         return self.finish(person, picture, rays.origins[0])
-
-    def finer(self, camera: Cameras) -> Cameras:
-        """Return a camera with ``supersampling`` rays per pixel and axis."""
-        count = self.keys.supersampling
-        scale = camera.intrinsics.new_tensor([count, count, 1])[:, None]
-        return Cameras(
-            camera.cam_from_world,
-            scale * camera.intrinsics,
-            count * camera.width,
-            count * camera.height,
-        )
 
     def finish(self, person: EncodedPerson, picture: FieldPicture, center: Tensor) -> FieldPicture:
         """Return the final picture of a camera at ``center`` (3,)."""

@@ -110,7 +110,7 @@ class PredictedField(Renderable):
     def state(self) -> State:
         tensors = {f"network.{name}": x.detach() for name, x in self.network.state_dict().items()}
         tensors |= {f"sources.{name}": x for name, x in vars(self.sources).items()}
-        body = {x.name: getattr(self.body, x.name) for x in dataclasses.fields(self.body)}
+        body = vars(dataclasses.replace(self.body))  # without what it keeps
         tensors |= {f"body.{name}": x for name, x in body.items()}
         tensors["numbers"] = torch.tensor([self.scale], dtype=torch.float64, device="cpu")
         return add_prefix("field", with_role(tensors, Role.SHARED))
@@ -244,9 +244,8 @@ class FieldPredictor(Predictor[FieldNetwork]):
     def run_config(self, views: Sequence[int]) -> Config:
         times = distinct_times(self.views).values()
         data = self.data_at_time(self.views[views[0]].time, times)
-        keys = set(PredictedFieldModel.model_fields) & set(type(self.section).model_fields)
-        options = {name: getattr(self.section, name) for name in keys - {"kind"}}
-        model = PredictedFieldModel.model_validate({"network": self.section.kind} | options)
+        keys = self.section.model_dump(include=set(PredictedFieldModel.model_fields) - {"kind"})
+        model = PredictedFieldModel.model_validate({"network": self.section.kind} | keys)
         return self.config.model_copy(update={"data": data, "model": model})
 
     def begin(self, model: Any, scene: Renderable, config: Config) -> None:
@@ -330,9 +329,7 @@ def _random_patch(image: Image, side: int, generator: torch.Generator) -> Image:
     """Return a patch around a random pixel of the person."""
     assert image.alpha is not None
     where = (image.alpha > _MIN_ALPHA).nonzero()
-    if not len(where):
-        return crop_window(image, 0, 0, side)
-    row, column = where[random_index(len(where), generator)].tolist()
+    row, column = where[random_index(len(where), generator)].tolist() if len(where) else (0, 0)
     return crop_window(image, column - side // 2, row - side // 2, side)
 
 

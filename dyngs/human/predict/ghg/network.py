@@ -19,7 +19,7 @@ import torch
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import KDTree
 from torch import Tensor, nn
-from torch.nn.functional import elu, max_pool2d, pad
+from torch.nn.functional import elu, grid_sample, max_pool2d, normalize, pad
 
 from dyngs.config import Config, DataConfig
 from dyngs.config.io import load_config, packaged_preset
@@ -161,11 +161,10 @@ def fill_unseen_colours(texels: Texels, rgb: Tensor, seen: Tensor) -> Tensor:
         return rgb
     positions = _positions(texels)
     observed = np.flatnonzero(is_seen)
-    count = min(_NEAREST, len(observed))
-    neighbours = KDTree(positions[observed]).query(positions[~is_seen], k=count)
-    # SciPy drops the axis of a single neighbour.
-    distance, near = (np.asarray(x).reshape(-1, count) for x in neighbours)
-    rows = torch.from_numpy(observed[near.astype(np.int64)]).to(rgb.device)
+    # SciPy drops the axis of a single neighbour unless its rank is given.
+    ranks = np.arange(min(_NEAREST, len(observed))) + 1
+    distance, near = KDTree(positions[observed]).query(positions[~is_seen], k=ranks)
+    rows = torch.from_numpy(observed[near]).to(rgb.device)
     weight = seen[rows] / (torch.from_numpy(distance).to(rgb) + _SOFT_DISTANCE).square()
     filled = rgb.clone()
     filled[torch.from_numpy(~is_seen).to(rgb.device)] = (weight[..., None] * rgb[rows]).sum(
@@ -221,12 +220,12 @@ def observe_texels(person: AtlasPerson, images: Iterable[tuple[Image, BodyPose]]
         vertices = scaffolds[0].double().cpu().numpy()
         normals = torch.from_numpy(vertex_normals(vertices, faces.cpu().numpy())).float()
         normals = _at_texels(person, normals.to(device))
-        normals = torch.nn.functional.normalize(normals, dim=1)
+        normals = normalize(normals, dim=1)
         offsets.append(normals @ pose.rotations[0])
         for level, vertices in enumerate(scaffolds):
             world = _at_texels(person, vertices)
             at, depth, in_frame = project_points(world, camera)
-            to_camera = torch.nn.functional.normalize(camera.centers[0] - world, dim=1)
+            to_camera = normalize(camera.centers[0] - world, dim=1)
             cosine = (to_camera * normals).sum(1)
             sampled = _sampled(torch.cat(planes, dim=-1), at) * in_frame[:, None]
             covered = sampled[:, 3]
@@ -285,9 +284,9 @@ def _edge_distances(image: Image) -> Tensor:
         )
     alpha = image.alpha.double().cpu().numpy()
     is_inside = np.pad(alpha > 0.5, 1)
-    within = np.asarray(distance_transform_edt(is_inside))[1:-1, 1:-1] - 0.5
-    beyond = np.asarray(distance_transform_edt(~is_inside))[1:-1, 1:-1] - 0.5
-    signed = np.where(alpha > 0.5, within, -beyond)
+    to_edge = [np.asarray(distance_transform_edt(x))[1:-1, 1:-1] for x in (is_inside, ~is_inside)]
+    signed = to_edge[0] - to_edge[1]
+    signed -= np.sign(signed) / 2
     signed = np.where(np.abs(signed) <= 0.5, alpha - 0.5, signed)
     return torch.from_numpy(signed).to(image.rgb_premultiplied)
 
@@ -298,22 +297,22 @@ def _nearest_depth(vertices: Tensor, faces: Tensor, camera: Cameras, at: Tensor)
     depth = depths(vertices, faces, camera)
     # The minimum of 2 x 2 pixels, infinite beyond the image.
     least = -max_pool2d(-pad(depth, (1, 1, 1, 1), value=torch.inf)[None], 2, 1)[0]
-    column, row = (
-        (at[:, i] + 0.5).floor().nan_to_num().clamp(0, size).long()
-        for i, size in enumerate((camera.width, camera.height))
-    )
-    return least[row, column]
+    grid = (2 * at + 1) / at.new_tensor(least.shape[::-1]) - 1
+    return grid_sample(
+        least[None, None],
+        grid.nan_to_num()[None, None],
+        mode="nearest",
+        padding_mode="border",
+        align_corners=False,
+    )[0, 0, 0]
 
 
 def _sampled(image: Tensor, at: Tensor) -> Tensor:
     """Sample an image (H, W, D) at columns and rows ``at`` (P, 2), bilinear; return (P, D)."""
-    size = at.new_tensor([image.shape[1], image.shape[0]])
-    grid = (2 * at / size - 1).nan_to_num().clamp(-2, 2)[None, None]
+    grid = 2 * at / at.new_tensor(image.shape[1::-1]) - 1
+    grid = grid.nan_to_num().clamp(-2, 2)[None, None]
     planes = image.permute(2, 0, 1)[None]
-    sampled = torch.nn.functional.grid_sample(
-        planes, grid, padding_mode="border", align_corners=False
-    )
-    return sampled[0, :, 0].T
+    return grid_sample(planes, grid, padding_mode="border", align_corners=False)[0, :, 0].T
 
 
 def _at_texels(person: AtlasPerson, values: Tensor) -> Tensor:
@@ -367,26 +366,23 @@ class Inpainting(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.layers = nn.ModuleList(
-            [
-                GatedConv(5, 24),
-                GatedConv(24, 48, stride=2),
-                GatedConv(48, 64, stride=2),
-                *(GatedConv(64, 64, dilation=2**i) for i in range(1, 4)),
-                GatedConv(64, 48),
-                GatedConv(48, 24),
-            ]
+        self.layers = nn.Sequential(
+            GatedConv(5, 24),
+            GatedConv(24, 48, stride=2),
+            GatedConv(48, 64, stride=2),
+            *(GatedConv(64, 64, dilation=2**i) for i in range(1, 4)),
+            nn.Upsample(scale_factor=2),
+            GatedConv(64, 48),
+            nn.Upsample(scale_factor=2),
+            GatedConv(48, 24),
+            nn.Conv2d(24, 3, 3, padding=1),
         )
-        self.last = nn.Conv2d(24, 3, 3, padding=1)
 
     def forward(self, rgb: Tensor, hole: Tensor, texels: Tensor) -> Tensor:
         """Return ``rgb`` (3, S, S) with its ``hole`` (1, S, S) filled; ``texels`` (1, S, S) are 1
         on the skin."""
         known = rgb * (1 - hole)
-        features = torch.cat([known, hole, texels])[None]
-        for i, layer in enumerate(self.layers):
-            features = layer(features if i < len(self.layers) - 2 else upsample(features))
-        return known + hole * self.last(features)[0].sigmoid()
+        return known + hole * self.layers(torch.cat([known, hole, texels])[None])[0].sigmoid()
 
 
 class AtlasNetwork(Encoder):

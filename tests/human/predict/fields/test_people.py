@@ -57,14 +57,14 @@ def test_sources_are_the_images_around_the_person(person: Person) -> None:
         cut = sources.rgba[i].permute(1, 2, 0)
         found = []
         for camera, rgba in (
-            (sources.camera(i), cut),
+            (sources.cameras.select(i), cut),
             (cameras_in_metres(image.cameras, scale), whole),
         ):
             at, _, _ = project_points(body.key_points[:12], camera)
             column, row = at.long().unbind(1)
             found.append(rgba[row, column])
         torch.testing.assert_close(*found)
-        torch.testing.assert_close(sources.centers[i], image.cameras.centers[0] / scale)
+        torch.testing.assert_close(sources.cameras.centers[i], image.cameras.centers[0] / scale)
 
 
 def test_views_are_spread_around_a_moment(person: Person) -> None:
