@@ -26,6 +26,7 @@ from dyngs.gaussians import Gaussians
 from dyngs.gaussians.levels import LevelScene
 from dyngs.gaussians.static_scene import StaticScene, ViewSides
 from dyngs.human.predict.fields.prediction import NETWORKS, PredictedField
+from dyngs.human.predict.keys import PredictedFieldModel
 from dyngs.human.predict.people import PosedBody, Sources
 from dyngs.models.renderable import Renderable
 from dyngs.ops.rays import Space
@@ -55,7 +56,7 @@ def scene_of(kind: str) -> Renderable:
             torch.ones(3, 4, 16, 16), torch.eye(4).expand(3, 4, 4), torch.eye(3).expand(3, 3, 3)
         )
         body = PosedBody(torch.zeros(4, 3), torch.zeros(3, 3), torch.zeros(1, 3, dtype=torch.long))
-        return PredictedField(NETWORKS[kind](generator), images, body, 1.0)
+        return PredictedField(NETWORKS[kind](generator, PredictedFieldModel()), images, body, 1.0)
     return scene_of_kind(kind)
 
 

@@ -59,7 +59,6 @@ class FieldPredictorModel(_FieldKeys):
     patch: int = Field(
         default=32,
         ge=8,
-        le=1024,
         description="side of the image patch of a training step, px; KeypointNeRF: 64",
     )
     lr: Positive = Field(

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -38,18 +39,75 @@ MULTIPLE = 8  # image sides are padded to multiples of this, px
 MARGIN = 8  # background around a person, px
 
 
+DILATION, EROSION = 0.06, 0.04  # distances of the boundary meshes from the body, m
+_NEAREST = 0.05  # near plane of depth maps, m
+_CELL = 0.02  # of the grid of heights, m
+
+
 @dataclass(frozen=True)
 class PosedBody:
-    """Posed body, m."""
+    """Posed body, m; a dilated and an eroded copy bound the clothed surface."""
 
     key_points: Tensor  # (J, 3)
     vertices: Tensor  # (M, 3)
     faces: Tensor  # (T, 3) int64
 
     @cached_property
-    def boundaries(self) -> BodyBoundaries:
-        """Boundaries of the clothed surface, made once."""
-        return BodyBoundaries(self)
+    def _normals(self) -> Tensor:
+        vertices = self.vertices.double().cpu().numpy()
+        normals = vertex_normals(vertices, self.faces.cpu().numpy())
+        return torch.from_numpy(normals).to(self.vertices)
+
+    @cached_property
+    def _heights(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Heights (1, 1, x, y, z) at the centres of a grid of cells, its least corner (3,) and its
+        size (3,)."""
+        vertices = self.vertices.double().cpu().numpy()
+        reach = DILATION + _CELL
+        low = vertices.min(axis=0) - reach
+        size = np.ceil((vertices.max(axis=0) + reach - low) / _CELL)
+        centres = low + _CELL * (np.moveaxis(np.indices(size.astype(int)), 0, -1) + 0.5)
+        distance, nearest = KDTree(vertices).query(centres, distance_upper_bound=reach)
+        nearest = np.minimum(nearest, len(vertices) - 1)  # of cells out of reach
+        outward = (centres - vertices[nearest]) * self._normals.double().cpu().numpy()[nearest]
+        is_inside = (outward.sum(-1) < 0) & (distance < reach)
+        height = np.where(is_inside, -distance, np.minimum(distance, reach))
+        grid, low, size = (
+            torch.from_numpy(x).to(self.vertices) for x in (height, low, _CELL * size)
+        )
+        return grid[None, None], low, size
+
+    def height(self, points: Tensor) -> Tensor:
+        """Return the signed distance (N,) of points (N, 3) to the nearest vertex, m; negative
+        inside.
+
+        Interpolated in a grid of 2 cm cells, and at most 8 cm.
+        """
+        heights, low, size = self._heights
+        at = (2 * (points - low) / size - 1).flip(-1)  # the last axis of the grid comes first
+        at = at[None, None, None]
+        return grid_sample(heights, at, padding_mode="border", align_corners=False).flatten()
+
+    def depth(self, camera: Cameras) -> Tensor:
+        """Return the depth map (H, W) of the body, m; infinite in the background."""
+        return depths(self.vertices, self.faces, camera)
+
+    def interval(self, camera: Cameras) -> tuple[Tensor, Tensor, Tensor]:
+        """Return where the rays of a camera may hit the clothed surface, as depth maps (H, W), m.
+
+        The first depth is the entry into the dilated mesh; the last is the eroded mesh or the exit
+        of the dilated mesh; the third is the body. Infinite where rays miss.
+        """
+        outer = self.vertices + DILATION * self._normals
+        inner = self.vertices - EROSION * self._normals
+        entry = depths(outer, self.faces, camera)
+        exit_depth = depths(outer, self.faces, camera, last=True)
+        # Parts thinner than the erosion turn inside out, so that faces of the eroded mesh may lie
+        # in front of the body; depths before the body are therefore raised.
+        eroded = depths(inner, self.faces, camera, front_faces=True)
+        body_depth = self.depth(camera)
+        end = torch.minimum(torch.maximum(eroded, body_depth + EROSION / 2), exit_depth)
+        return entry, torch.maximum(end, entry), body_depth
 
 
 @dataclass(frozen=True)
@@ -78,9 +136,7 @@ class Person:
     body: BodyTemplate  # in the person's shape, without a shape space
     motion: CapturedMotion
     images: ImageLoader
-    _bodies: dict[tuple[int | None, torch.device], tuple[PosedBody, float]] = field(
-        default_factory=dict
-    )
+    _bodies: dict[Any, tuple[PosedBody, float]] = field(default_factory=dict)
 
     @property
     def views(self) -> tuple[View, ...]:
@@ -164,10 +220,11 @@ def crop_source_images(images: Sequence[Image], scale: float) -> Sources:
         planes = torch.cat([crop.rgb_premultiplied, crop.alpha[..., None]], -1).permute(2, 0, 1)
         rgba.append(pad(planes, (0, width - planes.shape[2], 0, height - planes.shape[1])))
     cameras = [cameras_in_metres(crop.cameras, scale) for crop in crops]
-    poses, intrinsics = (
-        torch.cat([getattr(x, name) for x in cameras]) for name in ("cam_from_world", "intrinsics")
+    return Sources(
+        torch.stack(rgba),
+        torch.cat([x.cam_from_world for x in cameras]),
+        torch.cat([x.intrinsics for x in cameras]),
     )
-    return Sources(torch.stack(rgba), poses, intrinsics)
 
 
 def crop_window(image: Image, left: int, top: int, side: int) -> Image:
@@ -181,67 +238,6 @@ def crop_window(image: Image, left: int, top: int, side: int) -> Image:
     left = min(max(left, 0), camera.width - width)
     top = min(max(top, 0), camera.height - height)
     return crop_image(image, top, left, height, width)
-
-
-DILATION, EROSION = 0.06, 0.04  # distances of the boundary meshes from the body, m
-_NEAREST = 0.05  # near plane of depth maps, m
-_CELL = 0.02  # of the grid of heights, m
-
-
-class BodyBoundaries:
-    """Body mesh with a dilated and an eroded copy, which bound the clothed surface."""
-
-    def __init__(self, body: PosedBody) -> None:
-        self._faces = body.faces
-        self._body = body.vertices
-        vertices = self._body.cpu().numpy().astype(np.float64)
-        normals = vertex_normals(vertices, self._faces.cpu().numpy())
-        self._normals = torch.from_numpy(normals).to(self._body)
-        # Heights at the centres of a grid of cells, whose values end at ``reach``.
-        reach = DILATION + _CELL
-        low = vertices.min(axis=0) - reach
-        size = np.ceil((vertices.max(axis=0) + reach - low) / _CELL)
-        centres = low + _CELL * (np.moveaxis(np.indices(size.astype(int)), 0, -1) + 0.5)
-        distance, nearest = KDTree(vertices).query(centres, distance_upper_bound=reach)
-        nearest = np.minimum(nearest, len(vertices) - 1)
-        is_inside = ((centres - vertices[nearest]) * normals[nearest]).sum(-1) < 0
-        height = np.minimum(distance, reach) * np.where(is_inside & (distance < reach), -1, 1)
-        self._heights = torch.from_numpy(height).to(self._body)[None, None]
-        self._low = torch.from_numpy(low).to(self._body)
-        self._size = torch.from_numpy(_CELL * size).to(self._body)
-
-    def height(self, points: Tensor) -> Tensor:
-        """Return the signed distance (N,) of points (N, 3) to the nearest vertex, m; negative
-        inside.
-
-        Interpolated in a grid of 2 cm cells, and at most 8 cm.
-        """
-        at = 2 * (points - self._low) / self._size - 1
-        at = at.flip(-1)[None, None, None]  # the last axis of the grid comes first
-        found = grid_sample(self._heights, at, padding_mode="border", align_corners=False)
-        return found.flatten()
-
-    def depth(self, camera: Cameras) -> Tensor:
-        """Return the depth map (H, W) of the body, m; infinite in the background."""
-        return depths(self._body, self._faces, camera)
-
-    def interval(self, camera: Cameras) -> tuple[Tensor, Tensor, Tensor]:
-        """Return where the rays of a camera may hit the clothed surface, as depth maps (H, W), m.
-
-        The first depth is the entry into the dilated mesh; the last is the eroded mesh or the exit
-        of the dilated mesh; the third is the body. Infinite where rays miss.
-        """
-        outer = self._body + DILATION * self._normals
-        inner = self._body - EROSION * self._normals
-        entry = depths(outer, self._faces, camera)
-        exit_depth = depths(outer, self._faces, camera, last=True)
-        # Parts thinner than the erosion turn inside out, so that faces of the eroded mesh may lie
-        # in front of the body; depths before the body are therefore raised.
-        eroded = depths(inner, self._faces, camera, front_faces=True)
-        body_depth = self.depth(camera)
-        last = torch.minimum(torch.maximum(eroded, body_depth + EROSION / 2), exit_depth)
-        end = torch.where(body_depth.isfinite(), last, exit_depth)
-        return entry, torch.maximum(end, entry), body_depth
 
 
 @torch.no_grad()

@@ -73,7 +73,7 @@ class EgHumanNerf(FieldNetwork):
 
     needs_depth = True
 
-    def __init__(self, generator: torch.Generator, keys: EgHumanNerfKeys | None = None) -> None:
+    def __init__(self, generator: torch.Generator, keys: EgHumanNerfKeys) -> None:
         super().__init__(PARAMS.features, keys)
         width = PARAMS.width
         pixel = PARAMS.features + FINE
@@ -93,20 +93,23 @@ class EgHumanNerf(FieldNetwork):
 
     def prepare(self, features: SourceFeatures, body: PosedBody) -> Tensor:
         """Return the depth maps (V, 1, H, W) of the body in the images, m."""
-        depths = [body.boundaries.depth(camera) for camera in features.sources.cameras]
+        depths = [body.depth(camera) for camera in features.sources.cameras]
         return torch.stack(depths)[:, None].clamp(max=_FAR)
 
     def limits(self, person: EncodedPerson, camera: Cameras, z: Tensor) -> tuple[Tensor, Tensor]:
         """Values are start and end of the sampled interval, and the distance of the body, m."""
-        depths = torch.stack(person.body.boundaries.interval(camera), -1).view(-1, 3)
+        depths = torch.stack(person.body.interval(camera), -1).view(-1, 3)
         limits = (depths / z[:, None]).clamp(NEAR, _FAR)
         near, far, _ = limits.unbind(1)
         return ((near < _FAR) & (far > near)).nonzero()[:, 0], limits
 
-    def finish(self, person: EncodedPerson, picture: FieldPicture, center: Tensor) -> FieldPicture:
+    def render(
+        self, person: EncodedPerson, camera: Cameras, generator: torch.Generator | None = None
+    ) -> FieldPicture:
+        picture = super().render(person, camera, generator)
         if self.refine is None:
             return picture
-        middle = float((person.body.key_points.mean(0) - center).norm())
+        middle = float((person.body.key_points.mean(0) - camera.centers[0]).norm())
         colour = self.refine(picture.colour, picture.transmittance, picture.depth, middle)
         return replace(picture, colour=colour)
 
@@ -121,7 +124,7 @@ class EgHumanNerf(FieldNetwork):
             """Return points (R K, 3), their image features, and heights (R, K) above the body."""
             points = rays.origins[:, None] + rays.directions[:, None] * at[..., None]
             points = points.flatten(0, 1)
-            height = person.body.boundaries.height(points).view(at.shape)
+            height = person.body.height(points).view(at.shape)
             return points, features.sample(points), height.clamp(-PARAMS.limit, PARAMS.limit)
 
         def hints(seen: PointFeatures, height: Tensor, at: Tensor) -> Tensor:
@@ -169,7 +172,8 @@ class EgHumanNerf(FieldNetwork):
         change = PARAMS.limit * output[:, 0].view(near.shape)
         closer = interpolate_along_rays(at, signed, near) + change
         shared = torch.cat([mean_and_variance(seen.colours, weights), output[:, 1:]], -1)
-        colours = self.blend_images(seen, shared, [seen.colours, facts], excluded)
+        shared = shared.expand(len(facts), -1, -1)
+        colours = self.blend_images(seen, [seen.colours, shared, facts], excluded)
 
         opacity = opacities(near, closer, self.sharpness.exp(), self.keys.density)
         through = pad((1 - opacity).cumprod(1), (1, 0), value=1.0)
@@ -235,7 +239,8 @@ def opacities(at: Tensor, signed: Tensor, sharpness: Tensor, form: str = "neus")
     alpha Psi(-s) with the Laplace distribution function Psi of scale beta (Yariv et al. 2021;
     alpha = 1 / beta = ``sharpness``, per m).
     """
-    gaps = pad(at.diff(dim=1), (1, 1), mode="replicate")
+    gaps = at.diff(dim=1)
+    gaps = torch.cat([gaps[:, :1], gaps, gaps[:, -1:]], 1)
     half = (gaps[:, :-1] + gaps[:, 1:]) / 4
     if form == "laplace":
         tail = (-sharpness * signed.abs()).exp() / 2

@@ -67,7 +67,7 @@ HINTS = 4  # input features of a sample from bones and silhouettes
 class KeypointNerf(FieldNetwork):
     """KeypointNeRF network, see the module."""
 
-    def __init__(self, generator: torch.Generator, keys: EgHumanNerfKeys | None = None) -> None:
+    def __init__(self, generator: torch.Generator, keys: EgHumanNerfKeys) -> None:
         super().__init__(PARAMS.features, keys)
         width = PARAMS.width
         colours = 3 + FINE + PARAMS.geometry
@@ -103,12 +103,12 @@ class KeypointNerf(FieldNetwork):
         geometry = (
             self._geometry(person, points, code[:, which], seen) if is_training else geometry[which]
         )
-        per_view = torch.cat(
-            [seen.colours, geometry[:, 1:].expand(len(features.sources), -1, -1)], -1
-        )
+        count = len(features.sources)
+        per_view = torch.cat([seen.colours, geometry[:, 1:].expand(count, -1, -1)], -1)
+        pooled = mean_and_variance(per_view).expand(count, -1, -1)
         directions = rays.directions[samples.rays.long()]
         directions = relative_directions(directions, points, features.sources.cameras.centers)
-        colours = self.blend_images(seen, mean_and_variance(per_view), [per_view, directions])
+        colours = self.blend_images(seen, [per_view, pooled, directions])
         image = composite(density(geometry), colours, samples)
         return torch.cat([image.colour, image.transmittance[:, None], image.depth[:, None]], 1), []
 

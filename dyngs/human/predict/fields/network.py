@@ -141,11 +141,12 @@ def initialize_network(network: nn.Module, generator: torch.Generator) -> None:
 def mean_and_variance(values: Tensor, weights: Tensor | None = None) -> Tensor:
     """Return mean and variance (M, 2 D) over views of values (V, M, D), with weights (V, M) that
     sum to 1."""
-    if weights is None:
-        mean = values.mean(0)
-        return torch.cat([mean, (values - mean).square().mean(0)], -1)
-    mean = (weights[..., None] * values).sum(0)
-    return torch.cat([mean, (weights[..., None] * (values - mean).square()).sum(0)], -1)
+
+    def mean(x: Tensor) -> Tensor:
+        return x.mean(0) if weights is None else (weights[..., None] * x).sum(0)
+
+    middle = mean(values)
+    return torch.cat([middle, mean((values - middle).square())], -1)
 
 
 def relative_directions(directions: Tensor, points: Tensor, centers: Tensor) -> Tensor:
@@ -195,9 +196,9 @@ class FieldNetwork(nn.Module, ABC):
     needs_depth: ClassVar[bool] = False  # whether training needs depth maps
     blend: Perceptron  # logits of the images' colours
 
-    def __init__(self, features: int, keys: EgHumanNerfKeys | None) -> None:
+    def __init__(self, features: int, keys: EgHumanNerfKeys) -> None:
         super().__init__()
-        self.keys: Any = keys or EgHumanNerfKeys()
+        self.keys = keys
         self.encoder = ImageEncoder(features)
 
     def encode(self, sources: Sources, body: PosedBody) -> EncodedPerson:
@@ -243,31 +244,17 @@ class FieldNetwork(nn.Module, ABC):
         canvas = canvas.index_copy(0, rows, torch.cat([values for values, _ in found]))
         canvas = canvas.view(camera.height, count, camera.width, count, 5).mean((1, 3))
         samples = [(rows, *pair) for pair in found[0][1]] if torch.is_grad_enabled() else []
-        picture = FieldPicture(canvas[..., :3], canvas[..., 3], canvas[..., 4], samples)
-        return self.finish(person, picture, rays.origins[0])
-
-    def finish(self, person: EncodedPerson, picture: FieldPicture, center: Tensor) -> FieldPicture:
-        """Return the final picture of a camera at ``center`` (3,)."""
-        return picture
+        return FieldPicture(canvas[..., :3], canvas[..., 3], canvas[..., 4], samples)
 
     def blend_images(
-        self,
-        seen: PointFeatures,
-        shared: Tensor,
-        own: Sequence[Tensor],
-        excluded: Tensor | float = 0.0,
+        self, seen: PointFeatures, inputs: Sequence[Tensor], excluded: Tensor | float = 0.0
     ) -> Tensor:
         """Return the colours (M, 3) of points, blended from the images.
 
-        Args:
-            seen: features of the points.
-            shared: (M, D) features of the points that all images share.
-            own: features (V, M, D) of the points in each image.
-            excluded: (V, M) subtracted from the logits of the weights.
+        ``inputs`` (V, M, D) give the logits of the weights, from which ``excluded`` (V, M) is
+        subtracted.
         """
-        first, *others = own
-        inputs = torch.cat([first, shared.expand(len(first), -1, -1), *others], -1)
-        weights = (self.blend(inputs)[..., 0] - excluded).softmax(0)
+        weights = (self.blend(torch.cat(inputs, -1))[..., 0] - excluded).softmax(0)
         return (weights[..., None] * seen.rgb).sum(0)
 
     def penalty(self, picture: FieldPicture, image: Image, scale: float) -> Tensor:

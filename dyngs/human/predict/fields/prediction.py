@@ -168,47 +168,32 @@ def restore(model: PredictedFieldModel, checkpoint: Checkpoint) -> PredictedFiel
 class PredictedModel(Model[PredictedField]):
     """Stands in for a trainable model; predicted fields cannot be trained."""
 
+    scene: Any = None  # set by ``FieldPredictor.begin`` or ``restore``
+    leaves = ()
+
     def __init__(self, run: StartContext) -> None:
-        assert isinstance(run.config.model, PredictedFieldModel)
-        self._run_dir = run.config.run.dir
-        self._section = run.config.model
-        self._scene: PredictedField | None = None
-
-    def start_from(self, scene: PredictedField) -> None:
-        self._scene = scene
-
-    @property
-    def scene(self) -> PredictedField:
-        if self._scene is None:
-            raise self._untrained()
-        return self._scene
-
-    def _untrained(self) -> DyngsError:
-        return DyngsError(
-            f"{self._run_dir}: predicted fields cannot be trained; predict from other views, or "
-            "train `ngp` or `human` on the capture"
-        )
+        self._config = run.config
 
     def draw(
         self, image: Image, step: int, background: Tensor, *, depth: bool = False
     ) -> RenderOutput:
-        raise self._untrained()
+        raise DyngsError(
+            f"{self._config.run.dir}: predicted fields cannot be trained; predict from other views, "
+            "or train `ngp` or `human` on the capture"
+        )
 
     def update(self, step: int) -> UpdateResult:
         return UpdateResult(0)
-
-    @property
-    def leaves(self) -> Sequence[Tensor]:
-        return []
 
     def state(self) -> State:
         return self.scene.state()
 
     def restore(self, checkpoint: Checkpoint) -> None:
-        self._scene = restore(self._section, checkpoint)
+        model: Any = self._config.model
+        self.scene = restore(model, checkpoint)
 
     def place(self, device: torch.device) -> None:
-        self._scene = None if self._scene is None else self._scene.to(device)
+        self.scene = self.scene and self.scene.to(device)
 
 
 FEWEST_VIEWS = 2
@@ -249,7 +234,7 @@ class FieldPredictor(Predictor[FieldNetwork]):
         return self.config.model_copy(update={"data": data, "model": model})
 
     def begin(self, model: Any, scene: Renderable, config: Config) -> None:
-        model.start_from(scene)
+        model.scene = scene
 
 
 class FieldLearner(Learner[FieldNetwork]):

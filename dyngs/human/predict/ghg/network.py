@@ -297,22 +297,15 @@ def _nearest_depth(vertices: Tensor, faces: Tensor, camera: Cameras, at: Tensor)
     depth = depths(vertices, faces, camera)
     # The minimum of 2 x 2 pixels, infinite beyond the image.
     least = -max_pool2d(-pad(depth, (1, 1, 1, 1), value=torch.inf)[None], 2, 1)[0]
-    grid = (2 * at + 1) / at.new_tensor(least.shape[::-1]) - 1
-    return grid_sample(
-        least[None, None],
-        grid.nan_to_num()[None, None],
-        mode="nearest",
-        padding_mode="border",
-        align_corners=False,
-    )[0, 0, 0]
+    return _sampled(least[..., None], at + 0.5, "nearest")[:, 0]
 
 
-def _sampled(image: Tensor, at: Tensor) -> Tensor:
-    """Sample an image (H, W, D) at columns and rows ``at`` (P, 2), bilinear; return (P, D)."""
+def _sampled(image: Tensor, at: Tensor, mode: str = "bilinear") -> Tensor:
+    """Sample an image (H, W, D) at columns and rows ``at`` (P, 2); return (P, D)."""
     grid = 2 * at / at.new_tensor(image.shape[1::-1]) - 1
     grid = grid.nan_to_num().clamp(-2, 2)[None, None]
     planes = image.permute(2, 0, 1)[None]
-    return grid_sample(planes, grid, padding_mode="border", align_corners=False)[0, :, 0].T
+    return grid_sample(planes, grid, mode, "border", align_corners=False)[0, :, 0].T
 
 
 def _at_texels(person: AtlasPerson, values: Tensor) -> Tensor:

@@ -11,7 +11,6 @@ from dyngs.human.body.mesh import rasterize
 from dyngs.human.predict.people import (
     DILATION,
     EROSION,
-    BodyBoundaries,
     Person,
     PosedBody,
     cameras_in_metres,
@@ -84,7 +83,7 @@ def test_a_sphere_is_met_first_and_last(last: bool) -> None:
 
 
 def test_boundaries_of_a_ball_are_balls() -> None:
-    begin, end, met = BodyBoundaries(body(RADIUS)).interval(camera())
+    begin, end, met = body(RADIUS).interval(camera())
     middle = begin[12, 16], met[12, 16], end[12, 16]
     expected = (DISTANCE - RADIUS - DILATION, DISTANCE - RADIUS, DISTANCE - RADIUS + EROSION)
     torch.testing.assert_close(torch.stack(middle), torch.tensor(expected), atol=2e-3, rtol=0)
@@ -99,7 +98,7 @@ def test_boundaries_of_a_ball_are_balls() -> None:
 
 def test_a_thin_body_ends_behind_its_front() -> None:
     """Eroded by more than its radius it is inside out, and its back would come first."""
-    _, end, met = BodyBoundaries(body(0.03)).interval(camera())
+    _, end, met = body(0.03).interval(camera())
     assert float(end[12, 16]) > float(met[12, 16])
 
 
@@ -123,25 +122,25 @@ def test_depths_are_those_of_the_mesh_renderer_in_numpy(person: Person) -> None:
 
 def test_heights_grow_steadily_through_the_surface() -> None:
     """Distances to vertices alone, which lie apart, jump by twice their distance there."""
-    boundaries = BodyBoundaries(body(RADIUS))
+    ball = body(RADIUS)
     directions = torch.nn.functional.normalize(
         torch.randn(50, 3, generator=torch.Generator().manual_seed(0)), dim=1
     )
     heights = torch.linspace(-0.05, 0.05, 41)
     points = (RADIUS + heights)[:, None, None] * directions
-    found = boundaries.height(points.flatten(0, 1)).view(41, 50)
+    found = ball.height(points.flatten(0, 1)).view(41, 50)
     assert float((found - heights[:, None]).abs().max()) < 0.012
     steps = found.diff(dim=0)
     assert float(steps.min()) > 0
     assert float(steps.max()) < 0.005, "half a cell apart"
-    far = boundaries.height(torch.tensor([[0.0, 0, RADIUS + 0.3], [9, 9, 9]]))
+    far = ball.height(torch.tensor([[0.0, 0, RADIUS + 0.3], [9, 9, 9]]))
     torch.testing.assert_close(far, torch.full((2,), 0.08))
 
 
 def test_the_surface_of_a_dressed_person_lies_in_between(person: Person) -> None:
     own, scale = person.body_in(person.views[0])
     image = person.images[0]
-    begin, end, met = BodyBoundaries(own).interval(cameras_in_metres(image.cameras, scale))
+    begin, end, met = own.interval(cameras_in_metres(image.cameras, scale))
     assert image.depth is not None
     assert image.alpha is not None
     solid = (image.alpha > 0.99) & (image.depth > 0)

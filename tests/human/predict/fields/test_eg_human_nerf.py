@@ -20,7 +20,6 @@ from dyngs.human.predict.fields.keypoint_nerf import KeypointNerf
 from dyngs.human.predict.fields.network import EncodedPerson, FieldNetwork
 from dyngs.human.predict.keys import EgHumanNerfKeys
 from dyngs.human.predict.people import (
-    BodyBoundaries,
     Person,
     cameras_in_metres,
     crop_source_images,
@@ -178,7 +177,7 @@ def test_an_untrained_network_shows_the_body(person: Person) -> None:
     torch.testing.assert_close(
         part.transmittance, whole.transmittance[10:26, 8:24], atol=1e-4, rtol=1e-3
     )
-    seen = BodyBoundaries(body).depth(camera)
+    seen = body.depth(camera)
     alpha = 1 - whole.transmittance
     assert float(alpha[seen.isfinite()].mean()) > 0.8
     assert float(alpha[seen.isinf()].mean()) < 0.1

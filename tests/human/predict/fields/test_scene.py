@@ -29,7 +29,7 @@ KINDS = sorted(NETWORKS)
 def scene(request: pytest.FixtureRequest, person: Person) -> PredictedField:
     body, scale = person.body_in(person.views[0])
     sources = crop_source_images([person.images[i] for i in (0, 2, 4)], scale)
-    network = NETWORKS[request.param](torch.Generator().manual_seed(0))
+    network = NETWORKS[request.param](torch.Generator().manual_seed(0), PredictedFieldModel())
     return PredictedField(network, sources, body, scale, background=torch.ones(3))
 
 
