@@ -270,7 +270,7 @@ def depths(
         farthest = 1 / _NEAREST + 1
         a, b, c = (x / (farthest * x[:, 2:] - 1) for x in (a, b, c))
     patches = torch.stack([a, (a + b) / 2, (a + c) / 2, b, (b + c) / 2, c], 1)[shown]
-    own = replace(camera, cam_from_world=torch.eye(4).to(pose)[None])
+    own = replace(camera, cam_from_world=torch.eye(4, device=pose.device)[None])
     ids, uv = visible_patches(patches, own, 1e-3, segments=1)
     meets = ids[0] >= 0
     weights = torch.cat([uv, 1 - uv.sum(-1, keepdim=True)], -1)[0, meets]

@@ -247,7 +247,7 @@ class FieldNetwork(nn.Module, ABC):
         return FieldPicture(canvas[..., :3], canvas[..., 3], canvas[..., 4], samples)
 
     def blend_images(
-        self, seen: PointFeatures, inputs: Sequence[Tensor], excluded: Tensor | float = 0.0
+        self, seen: PointFeatures, inputs: list[Tensor], excluded: Tensor | float = 0.0
     ) -> Tensor:
         """Return the colours (M, 3) of points, blended from the images.
 

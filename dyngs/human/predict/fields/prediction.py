@@ -169,7 +169,7 @@ class PredictedModel(Model[PredictedField]):
     """Stands in for a trainable model; predicted fields cannot be trained."""
 
     scene: Any = None  # set by ``FieldPredictor.begin`` or ``restore``
-    leaves = ()
+    leaves: Any = ()
 
     def __init__(self, run: StartContext) -> None:
         self._config = run.config

@@ -162,7 +162,7 @@ def fill_unseen_colours(texels: Texels, rgb: Tensor, seen: Tensor) -> Tensor:
     positions = _positions(texels)
     observed = np.flatnonzero(is_seen)
     # SciPy drops the axis of a single neighbour unless its rank is given.
-    ranks = np.arange(min(_NEAREST, len(observed))) + 1
+    ranks: Any = np.arange(min(_NEAREST, len(observed))) + 1
     distance, near = KDTree(positions[observed]).query(positions[~is_seen], k=ranks)
     rows = torch.from_numpy(observed[near]).to(rgb.device)
     weight = seen[rows] / (torch.from_numpy(distance).to(rgb) + _SOFT_DISTANCE).square()

@@ -42,7 +42,7 @@ def test_points_show_what_their_pixels_show() -> None:
 
 def test_features_are_sampled_where_convolutions_centre_them() -> None:
     """Feature i at 1/4 of the resolution is that of pixel 4 i, not of the middle of four."""
-    layers = [layer[0] for layer in ImageEncoder(8).levels.down][:2]
+    layers = [layer[0] for layer in ImageEncoder(8).levels.down][:2]  # pyright: ignore[reportIndexIssue]
     images = torch.randn(2, 4, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0))
     found = images
     for layer, stride in zip(layers, (2, 4), strict=True):

@@ -133,7 +133,7 @@ def test_inpainting_fills_the_dilated_hole_alone(shown: Shown) -> None:
     size = NET.resolution
     unseen = np.zeros(size * size, dtype=bool)
     unseen[sitter.texels.index.numpy()] = (maps.seen[0] == 0).numpy()
-    hole = binary_dilation(unseen.reshape(size, size), np.ones((5, 5)))
+    hole = np.asarray(binary_dilation(unseen.reshape(size, size), np.ones((5, 5))), dtype=bool)
     expected = hole.ravel()[sitter.texels.index.numpy()]
     assert 0.1 < expected.mean() < 0.9
     assert np.array_equal(beside.numpy(), ~expected)
@@ -170,6 +170,7 @@ def test_all_heads_learn(shown: Shown) -> None:
     made = constant_network()
     avatar = predict_avatar(*shown, MEAN, made)
     sum(x.square().sum() for x in avatar.gaussians.tensors().values()).backward()  # type: ignore[union-attr]
+    assert made.heads.bias is not None
     grad = made.heads.bias.grad
     assert grad is not None
     moved = dict(zip(HEADS, grad.view(2, -1)[0].split(tuple(HEADS.values())), strict=True))
