@@ -54,9 +54,7 @@ class PosedBody:
 
     @cached_property
     def _normals(self) -> Tensor:
-        vertices = self.vertices.double().cpu().numpy()
-        normals = vertex_normals(vertices, self.faces.cpu().numpy())
-        return torch.from_numpy(normals).to(self.vertices)
+        return mesh_normals(self.vertices, self.faces)
 
     @cached_property
     def _heights(self) -> tuple[Tensor, Tensor, Tensor]:
@@ -124,8 +122,7 @@ class Sources:
     @property
     def cameras(self) -> Cameras:
         """The V cameras, in metres."""
-        height, width = self.rgba.shape[2:]
-        return Cameras(self.cam_from_world, self.intrinsics, width, height)
+        return Cameras(self.cam_from_world, self.intrinsics, *self.rgba.shape[:1:-1])
 
 
 @dataclass(frozen=True)
@@ -240,6 +237,12 @@ def crop_window(image: Image, left: int, top: int, side: int) -> Image:
     return crop_image(image, top, left, height, width)
 
 
+def mesh_normals(vertices: Tensor, faces: Tensor) -> Tensor:
+    """Return unit vertex normals (M, 3), computed in float64."""
+    normals = vertex_normals(vertices.double().cpu().numpy(), faces.cpu().numpy())
+    return torch.from_numpy(normals).to(vertices)
+
+
 @torch.no_grad()
 def depths(
     vertices: Tensor,
@@ -262,13 +265,12 @@ def depths(
     local = vertices @ pose[:3, :3].T + pose[:3, 3]
     corners = local[faces]
     shown = (corners[..., 2] > _NEAREST).all(1)
+    farthest = 1 / _NEAREST + 1
+    if last:  # a projective map that keeps pixels and planes and reverses the order of depths
+        corners = corners / (farthest * corners[..., 2:] - 1)
     a, b, c = corners.unbind(1)
     if front_faces:
         shown &= (a * torch.linalg.cross(b, c)).sum(-1) < 0
-    if last:
-        # A projective map that keeps pixels and planes and reverses the order of depths.
-        farthest = 1 / _NEAREST + 1
-        a, b, c = (x / (farthest * x[:, 2:] - 1) for x in (a, b, c))
     patches = torch.stack([a, (a + b) / 2, (a + c) / 2, b, (b + c) / 2, c], 1)[shown]
     own = replace(camera, cam_from_world=torch.eye(4, device=pose.device)[None])
     ids, uv = visible_patches(patches, own, 1e-3, segments=1)
@@ -277,6 +279,6 @@ def depths(
     depth = (patches[ids[0, meets].long()][:, [0, 3, 5], 2] * weights).sum(-1)
     if last:
         depth = depth / (farthest * depth - 1)
-    image = vertices.new_full((camera.height, camera.width), torch.inf)
+    image = uv.new_full(meets.shape, torch.inf)
     image[meets] = depth
     return image

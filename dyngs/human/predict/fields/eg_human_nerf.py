@@ -64,6 +64,7 @@ class EgHumanNerfParams:
 
 PARAMS = EgHumanNerfParams()
 HINTS = 8  # input features of a sample from the body and the silhouettes
+_SMALL_AT_FIRST = ("guide.layers.2.weight", "surface.layers.2.weight", "refine.last.weight")
 _FAR = 1e3  # depth of the background, m
 _EDGE = 0.05  # alpha of rays that miss the person; those above 1 - _EDGE hit it
 
@@ -85,11 +86,10 @@ class EgHumanNerf(FieldNetwork):
         self.sharpness = nn.Parameter(torch.tensor(math.log(PARAMS.sharpness), device="cpu"))
         self.refine = Refinement() if self.keys.refine else None
         initialize_network(self, generator)
-        last = [self.guide.layers[-1], self.surface.layers[-1]]
-        last += [] if self.refine is None else [self.refine.last]
         with torch.no_grad():  # start with the body surface and unchanged colours
-            for layer in last:
-                layer.weight.mul_(0.1)  # pyright: ignore[reportCallIssue, reportAttributeAccessIssue]
+            for name, weight in self.named_parameters():
+                if name in _SMALL_AT_FIRST:
+                    weight.mul_(0.1)
 
     def prepare(self, features: SourceFeatures, body: PosedBody) -> Tensor:
         """Return the depth maps (V, 1, H, W) of the body in the images, m."""
@@ -101,7 +101,7 @@ class EgHumanNerf(FieldNetwork):
         depths = torch.stack(person.body.interval(camera), -1).view(-1, 3)
         limits = (depths / z[:, None]).clamp(NEAR, _FAR)
         near, far, _ = limits.unbind(1)
-        return ((near < _FAR) & (far > near)).nonzero()[:, 0], limits
+        return (far > near).nonzero()[:, 0], limits  # not where all are _FAR
 
     def render(
         self, person: EncodedPerson, camera: Cameras, generator: torch.Generator | None = None
@@ -150,12 +150,12 @@ class EgHumanNerf(FieldNetwork):
         inputs = [mean_and_variance(seen.features), hints(seen, height, at)]
         signed = height + PARAMS.limit * self.guide(torch.cat(inputs, -1)).view(at.shape)
 
-        near = expected_surface(at.detach(), signed.detach())[:, None]
-        near = near + at.new_tensor(PARAMS.offsets)
+        surface = expected_surface(at.detach(), signed.detach())[:, None]
+        near = surface + at.new_tensor(PARAMS.offsets)
         points, seen, height = sample_at(near)
         grid, depth = features.project(points)
-        surface = sample_maps(person.extra, grid, "nearest")[..., 0].where(seen.alpha > 0, _FAR)
-        behind = (depth - surface) / PARAMS.hidden_by
+        front = sample_maps(person.extra, grid, "nearest")[..., 0].where(seen.alpha > 0, _FAR)
+        behind = (depth - front) / PARAMS.hidden_by
         hidden = behind > 1
         # Images in which the sample is hidden, unless it is hidden in all.
         excluded = 1e4 * (hidden & ~hidden.all(0))

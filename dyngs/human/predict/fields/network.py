@@ -117,8 +117,7 @@ class SourceFeatures:
         local = points @ pose[:, :3, :3].mT + pose[:, None, :3, 3]
         depth = local[..., 2]
         pixels = (local @ sources.intrinsics.mT)[..., :2] / depth.clamp_min(_MIN_DEPTH)[..., None]
-        height, width = sources.rgba.shape[2:]
-        grid = 2 * pixels / pixels.new_tensor([width, height]) - 1
+        grid = 2 * pixels / pixels.new_tensor(sources.rgba.shape[:1:-1]) - 1
         return torch.where(depth[..., None] > _MIN_DEPTH, grid, 2.0).clamp(-2, 2), depth
 
 

@@ -178,8 +178,8 @@ class PredictedModel(Model[PredictedField]):
         self, image: Image, step: int, background: Tensor, *, depth: bool = False
     ) -> RenderOutput:
         raise DyngsError(
-            f"{self._config.run.dir}: predicted fields cannot be trained; predict from other views, "
-            "or train `ngp` or `human` on the capture"
+            f"{self._config.run.dir}: predicted fields cannot be trained; predict from other "
+            "views, or train `ngp` or `human` on the capture"
         )
 
     def update(self, step: int) -> UpdateResult:

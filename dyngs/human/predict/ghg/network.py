@@ -42,11 +42,10 @@ from dyngs.human.avatar.training import HumanTraining
 from dyngs.human.body.atlas import Texels, atlas_texels
 from dyngs.human.body.body import BodyTemplate
 from dyngs.human.body.body_reader import load_template
-from dyngs.human.body.mesh import vertex_normals
 from dyngs.human.fit.fitted_capture import ensure_fitted_body
 from dyngs.human.keys import HumanModel, HumanPredictorModel
 from dyngs.human.predict.gps.rectification import spread
-from dyngs.human.predict.people import Person, captured_person, depths
+from dyngs.human.predict.people import Person, captured_person, depths, mesh_normals
 from dyngs.models.checkpoint import CONFIG_ADVICE, Checkpoint
 from dyngs.models.prediction import (
     Encoder,
@@ -79,10 +78,8 @@ class AtlasPerson:
 
     def observe(self, views: Sequence[int]) -> TexelMaps:
         """Return the texel maps of some views."""
-        all_views = self.person.views
-        poses = [self.person.pose_in(all_views[i]) for i in views]
-        images = (self.person.images[i] for i in views)
-        return observe_texels(self, zip(images, poses, strict=True))
+        own = self.person
+        return observe_texels(self, ((own.images[i], own.pose_in(own.views[i])) for i in views))
 
 
 def atlas_person(person: Person, model: HumanPredictorModel) -> AtlasPerson:
@@ -92,10 +89,9 @@ def atlas_person(person: Person, model: HumanPredictorModel) -> AtlasPerson:
     heights = tuple(sorted(set(model.scaffold_heights)))
     gaussians, anchors = texel_gaussians(texels, heights, 0)
     skeleton = Skeleton(body.joints, body.parents)
-    normals = vertex_normals(body.vertices.double().cpu().numpy(), body.faces.cpu().numpy())
     return AtlasPerson(
         person=person,
-        normals=torch.from_numpy(normals).to(body.vertices),
+        normals=mesh_normals(body.vertices, body.faces),
         texels=texels,
         mirror=mirror_texels(texels),
         heights=heights,
@@ -144,7 +140,7 @@ def mirror_texels(texels: Texels) -> Tensor:
     """Return the index (P,) of the texel nearest to the mirror image of each, in the rest pose."""
     positions = _positions(texels)
     nearest = KDTree(positions).query(positions * np.array([-1.0, 1, 1, -1, 1, 1]))[1]
-    return torch.from_numpy(np.asarray(nearest, dtype=np.int64)).to(texels.index.device)
+    return torch.as_tensor(nearest, device=texels.index.device)
 
 
 def fill_unseen_colours(texels: Texels, rgb: Tensor, seen: Tensor) -> Tensor:
@@ -217,10 +213,7 @@ def observe_texels(person: AtlasPerson, images: Iterable[tuple[Image, BodyPose]]
         alpha = white if image.alpha is None else image.alpha
         planes = [image.rgb_premultiplied, alpha[..., None], _edge_distances(image)[..., None]]
         scaffolds = [_posed_vertices(person, pose, height) for height in person.heights]
-        vertices = scaffolds[0].double().cpu().numpy()
-        normals = torch.from_numpy(vertex_normals(vertices, faces.cpu().numpy())).float()
-        normals = _at_texels(person, normals.to(device))
-        normals = normalize(normals, dim=1)
+        normals = normalize(_at_texels(person, mesh_normals(scaffolds[0], faces)), dim=1)
         offsets.append(normals @ pose.rotations[0])
         for level, vertices in enumerate(scaffolds):
             world = _at_texels(person, vertices)

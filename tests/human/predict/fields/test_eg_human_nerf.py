@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -142,9 +143,11 @@ def test_refinement_does_not_see_the_sides_of_a_patch() -> None:
 
 
 @pytest.mark.parametrize("network_of", [EgHumanNerf, KeypointNerf])
-def test_supersampling_averages_rays(network_of: type[FieldNetwork], person: Person) -> None:
+def test_supersampling_averages_rays(
+    network_of: Callable[..., FieldNetwork], person: Person
+) -> None:
     keys = EgHumanNerfKeys(supersampling=2, refine=False)
-    network = network_of(torch.Generator().manual_seed(0), keys)  # pyright: ignore[reportCallIssue, reportArgumentType]
+    network = network_of(torch.Generator().manual_seed(0), keys)
     own = known(network, person)
     scale = person.body_in(person.views[0])[1]
     camera = cameras_in_metres(person.images[1].cameras, scale)

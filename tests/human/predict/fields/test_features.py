@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 
 from dyngs.human.predict.fields.network import ImageEncoder, SourceFeatures
@@ -42,7 +44,8 @@ def test_points_show_what_their_pixels_show() -> None:
 
 def test_features_are_sampled_where_convolutions_centre_them() -> None:
     """Feature i at 1/4 of the resolution is that of pixel 4 i, not of the middle of four."""
-    layers = [layer[0] for layer in ImageEncoder(8).levels.down][:2]  # pyright: ignore[reportIndexIssue]
+    down: Any = ImageEncoder(8).levels.down
+    layers = [layer[0] for layer in down][:2]
     images = torch.randn(2, 4, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0))
     found = images
     for layer, stride in zip(layers, (2, 4), strict=True):

@@ -151,7 +151,8 @@ def test_a_gated_convolution_is_elu_times_twice_the_sigmoid() -> None:
     layer = GatedConv(2, 3, stride=2, dilation=2).double()
     images = torch.randn(1, 2, 8, 8, dtype=torch.float64, requires_grad=True)
     plain = torch.nn.functional.conv2d(images, layer.weight, layer.bias, 2, 2, 2)
-    value, gate = plain[:, :3], plain[:, 3:]
+    value = plain[:, :3]
+    gate = plain[:, 3:]
     expected = torch.where(value > 0, value, value.exp() - 1) * 2 / (1 + (-gate).exp())
     torch.testing.assert_close(layer(images), expected)
     assert torch.autograd.gradcheck(layer, images)
