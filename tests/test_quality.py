@@ -127,7 +127,8 @@ def test_a_ball_that_rolls_is_followed_as_a_body(
     )
     assert report.psnr > 22.8  # 23.19 to 23.28
     assert report.psnr_moving is not None
-    assert report.psnr_moving > 18.7  # 19.10 to 19.70
+    # 18.50 to 19.70: processors round differently, and the search for the body amplifies it.
+    assert report.psnr_moving > 18.2
 
 
 def test_a_person(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
