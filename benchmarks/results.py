@@ -410,6 +410,11 @@ def comparison_table(found: Sequence[Mapping[str, Any]]) -> str:
     )
 
 
+# Smallest fraction of a pruned row; controls that are only fine-tuned remove less.
+PRUNED_FROM = 0.01
+SHOWN_SCORES = ("not pruned", "ours")
+
+
 def pruning_table(found: Sequence[Mapping[str, Any]]) -> str:
     """Return a Markdown table of rows of benchmarks/prune.py."""
     rows = [["capture", "score", "removed", "masks", "PSNR, dB", "MB", "stored, MB", "frames/s"]]
@@ -419,6 +424,26 @@ def pruning_table(found: Sequence[Mapping[str, Any]]) -> str:
         cells = [row["capture"] or "", row["score"], removed, row["masks"], number(row["psnr"])]
         rows.append([*cells, number(row["mb"]), stored, number(row["fps"], 0)])
     return table(rows)
+
+
+def pruning_section(found: Sequence[Mapping[str, Any]]) -> str:
+    """Return tables of PSNR by score and removed fraction, and of sizes and speeds of one score."""
+    fractions = sorted({row["fraction"] for row in found if row["fraction"] >= PRUNED_FROM})
+    head = ["capture", "score", "masks", *(f"{fraction:.0%}" for fraction in fractions)]
+    lines: dict[tuple[str, str, str], dict[float, float]] = {}
+    for row in found:
+        if row["fraction"] >= PRUNED_FROM:
+            key = (row["capture"], row["score"], row["masks"])
+            lines.setdefault(key, {})[row["fraction"]] = row["psnr"]
+    rows = [head]
+    for key, values in lines.items():
+        rows.append([*key, *(number(values.get(fraction)) for fraction in fractions)])
+    shown = [row for row in found if row["masks"] == "none" and row["score"] in SHOWN_SCORES]
+    return (
+        "PSNR in dB by the fraction that was removed:\n\n"
+        f"{table(rows)}\n\nSizes and speeds. *Ours, 0 %*: nothing removed, but fine-tuned as the others:\n\n"
+        f"{pruning_table(shown)}\n"
+    )
 
 
 def mega_table(found: Sequence[Mapping[str, Any]]) -> str:
@@ -549,9 +574,9 @@ def systems_page(results: Mapping[str, Result], moving: Sequence[Mapping[str, An
     pruning = load_rows(PRUNING)
     if pruning:
         text += (
-            "\n## Pruning\n\n4D Gaussians pruned and fine-tuned. Scores and masks:\n"
-            "[motion](concepts/motion.md#pruning-over-time). Frames/s at 400x400 on two threads.\n\n"
-            f"{pruning_table(pruning)}\n"
+            "\n## Pruning\n\n4D Gaussians pruned and fine-tuned for 500 steps. Scores and masks:\n"
+            "[motion](concepts/motion.md#pruning-over-time). Frames/s at 400x400 on two threads, timed\n"
+            f"alternately on a busy machine.\n\n{pruning_section(pruning)}"
         )
     parts = load_rows(MEGA)
     if parts:
