@@ -62,8 +62,13 @@ def test_a_comparison_shows_means_spread_and_refusals(results: ModuleType) -> No
     assert "Not trained: rig, free: no times" in text
 
 
-def test_a_row_for_each_published_system(results: ModuleType) -> None:
-    page = results.systems_page({}, [])
+def test_a_row_for_each_published_system(
+    results: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as nothing_stored:
+        for name in ("RESULTS", "PRUNING", "MEGA"):
+            nothing_stored.setattr(results, name, tmp_path / name)
+        page = results.systems_page({}, [])
     assert page.count("| not measured |") == 18
     assert "36.39 dB" in page
     stored = results.systems_page(results.load_results(), [])
@@ -77,6 +82,18 @@ def test_a_system_shows_the_compared_variant_nearest_to_its_paper(results: Modul
     assert [x.figure for x in results.own_figures(system, {}, rows)] == ["rig 20.00"]
     rows.append(about | {"variant": "4dgs", "psnr": 30.0})
     assert [x.figure for x in results.own_figures(system, {}, rows)] == ["rig 30.00"]
+
+
+def test_a_system_shows_the_rows_that_it_selects(
+    results: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    row = {"capture": "rig", "commit": "c0ffee00", "psnr": 20.0, "mb": 3.0, "part": "network"}
+    (tmp_path / "comparisons").mkdir()
+    stored = tmp_path / "comparisons/mega.json"
+    stored.write_text(json.dumps([row, row | {"part": "zip", "psnr": 10.0}]), encoding="utf-8")
+    monkeypatch.setattr(results, "RESULTS", tmp_path)
+    system = {"rows": {"mega": {"part": "network"}}, "command": "dyngs"}
+    assert [x.figure for x in results.own_figures(system, {}, [])] == ["rig 20.00, 3.00 MB"]
 
 
 def test_every_compared_variant_is_a_valid_configuration() -> None:
