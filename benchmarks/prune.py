@@ -36,7 +36,7 @@ from typing import Any
 
 import torch
 from dynamic import open_model, write_result
-from results import PRUNING, current_commit, pruning_table
+from results import PRUNING, current_commit, load_rows, pruning_table
 
 from dyngs.api.prune import export_folder, prune_run, prune_to_loss
 from dyngs.api.scene_file import write_scene_file
@@ -170,8 +170,8 @@ def print_speeds(run_dir: Path, folder: Path, capture: str | None) -> None:
         timed.append(row | facts)
     print(pruning_table(timed))
     if capture is not None:
-        before = json.loads(PRUNING.read_text(encoding="utf-8")) if PRUNING.is_file() else []
-        write_result(PRUNING, [row for row in before if row["capture"] != capture] + timed)
+        others = [row for row in load_rows(PRUNING) if row["capture"] != capture]
+        write_result(PRUNING, others + timed)
 
 
 def run_rows(given: argparse.Namespace) -> None:

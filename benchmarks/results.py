@@ -413,6 +413,18 @@ def comparison_table(found: Sequence[Mapping[str, Any]]) -> str:
 # Smallest fraction of a pruned row; controls that are only fine-tuned remove less.
 PRUNED_FROM = 0.01
 SHOWN_SCORES = ("not pruned", "ours")
+# Names of the scores of benchmarks/prune.py as values of `prune.score`
+SCORE_NAMES = {
+    "spatial": "contribution",
+    "both_signed": "variation, signed",
+    "both": "variation",
+    "ours": "sensitivity",
+}
+
+
+def score_name(row: Mapping[str, Any]) -> str:
+    """Return the score of a row of benchmarks/prune.py as a value of ``prune.score``."""
+    return SCORE_NAMES.get(row["score"], row["score"])
 
 
 def pruning_table(found: Sequence[Mapping[str, Any]]) -> str:
@@ -421,7 +433,7 @@ def pruning_table(found: Sequence[Mapping[str, Any]]) -> str:
     for row in found:
         stored = number(row.get("stored_mb"), 3)
         removed = f"{row['fraction']:.0%}"
-        cells = [row["capture"] or "", row["score"], removed, row["masks"], number(row["psnr"])]
+        cells = [row["capture"] or "", score_name(row), removed, row["masks"], number(row["psnr"])]
         rows.append([*cells, number(row["mb"]), stored, number(row["fps"], 0)])
     return table(rows)
 
@@ -433,7 +445,7 @@ def pruning_section(found: Sequence[Mapping[str, Any]]) -> str:
     lines: dict[tuple[str, str, str], dict[float, float]] = {}
     for row in found:
         if row["fraction"] >= PRUNED_FROM:
-            key = (row["capture"], row["score"], row["masks"])
+            key = (row["capture"], score_name(row), row["masks"])
             lines.setdefault(key, {})[row["fraction"]] = row["psnr"]
     rows = [head]
     for key, values in lines.items():
@@ -441,7 +453,7 @@ def pruning_section(found: Sequence[Mapping[str, Any]]) -> str:
     shown = [row for row in found if row["masks"] == "none" and row["score"] in SHOWN_SCORES]
     return (
         "PSNR in dB by the fraction that was removed:\n\n"
-        f"{table(rows)}\n\nSizes and speeds. *Ours, 0 %*: nothing removed, but fine-tuned as the others:\n\n"
+        f"{table(rows)}\n\nSizes and speeds. *sensitivity, 0%*: nothing removed, but fine-tuned as the others:\n\n"
         f"{pruning_table(shown)}\n"
     )
 
@@ -570,7 +582,13 @@ def systems_page(results: Mapping[str, Result], moving: Sequence[Mapping[str, An
         "```bash\n" + "\n".join(commands) + "\n```\n"
     )
     if moving:
-        text += f"\n## Moving scenes at equal minutes\n\n{comparison_table(moving)}"
+        text += (
+            "\n## Moving scenes at equal minutes\n\n"
+            "Variants are values of `model.deform.kind` in the preset `dynamic`, and the preset `4dgs`.\n"
+            "*all*: `model.select_moving=false`; *selected*: true. *attached*:\n"
+            "`model.deform.position_gradient=true`; *detached*: false.\n\n"
+            f"{comparison_table(moving)}"
+        )
     pruning = load_rows(PRUNING)
     if pruning:
         text += (

@@ -101,7 +101,7 @@ NOISE = 0.1  # px; nearer samples get no gradient
 
 
 def reference_weights(given: Boundaries) -> Tensor:
-    """(1, N, H, W) weights of Gaussians at pixels: every outline sample of their patches is tried."""
+    """Return the weights (1, N, H, W) of Gaussians at pixels, from all samples of their outlines."""
     height, width = given.rows.shape
     shown = torch.where(given.rows >= 0, given.ids[given.rows.clamp_min(0).long()], -1)
     outline = torch.zeros(len(given.ids), dtype=torch.bool)

@@ -191,7 +191,8 @@ def test_stored_files_and_meshes(run: Path, tmp_path: Path) -> None:
     out = tmp_path / "stored"
     assert main(["export", str(run), "--format", "dyngs", "--out", str(out)]) == 0
     opened = open_run(run)
-    whole, stored = opened.renderable, open_run(out).renderable
+    whole = opened.renderable
+    stored = open_run(out).renderable
     view = training_cameras(opened.capture.splits["train"][:1], opened.config.data)[0]
     assert psnr(stored.render(view).rgb, whole.render(view).rgb) > 30
     mesh = tmp_path / "mesh.ply"
@@ -209,7 +210,7 @@ def test_mismatched_shapes_are_refused() -> None:
 
 
 def test_checkpoints_without_gaussians_open(run: Path) -> None:
-    """As those of runs from before Gaussians."""
+    """Checkpoints that were written before Gaussians were added have none of their tensors."""
     checkpoint = latest_checkpoint(run)
     assert checkpoint is not None
     new = {f"triangles.{name}" for name in ("log_scales", "quats", "scale")}

@@ -1,5 +1,4 @@
-"""Both networks of disparities: a sweep against known shifts, correlations and their look-up against
-loops, upsampling, what the networks find."""
+"""Networks that estimate disparities: sweep, correlation, look-up, upsampling and training."""
 
 from __future__ import annotations
 
