@@ -119,7 +119,7 @@ def allowed_values(info: FieldInfo, plural: bool = False) -> str:
         text = f"a {'non-empty ' if some else ''}list of {items}"
     else:
         text = (many if plural else one).get(plain, str(plain))  # type: ignore[arg-type]
-    symbols = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
+    symbols = {"multiple_of": "a multiple of", "gt": ">", "ge": ">=", "lt": "<", "le": "<="}
     bounds = [
         f"{symbol} {getattr(item, name):g}"
         for item in info.metadata

@@ -218,6 +218,7 @@ DYNAMIC = "model.kind=dynamic"
         (f"{DYNAMIC} model.defrom.kind=mlp", "did you mean 'model.deform.kind'"),
         (f"{DYNAMIC} model.deform.nodes=5", "belongs to model.deform.kind=control_nodes, not to"),
         (f"{DYNAMIC} model.deform.channels=0", "model.deform.channels must be an integer >= 1"),
+        ("model.kind=gps model.channels=50", "<= 768 and a multiple of 24, not 50"),
         (f"{DYNAMIC} model.deform=mlp", "model.deform is a section"),
     ],
 )

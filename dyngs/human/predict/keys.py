@@ -129,7 +129,7 @@ class GpsModel(SceneModel):
         ge=24,
         le=768,
         multiple_of=24,
-        description="channels of matching features and hidden state, a multiple of 24, "
+        description="channels of matching features and hidden state, "
         "matching=recurrent only; fewer are faster",
     )
     consistency_weight: float = Field(
