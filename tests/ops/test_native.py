@@ -185,8 +185,16 @@ def drawn_after_forks(threads: int) -> list[str]:
         "PYTHONPATH": os.pathsep.join(p for p in sys.path if p),
         "OMP_NUM_THREADS": str(threads),
     }
-    command = [sys.executable, "-c", FORKED]
-    run = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
+    # Python looks in the working directory first: there is the package under test.
+    package_parent = Path(native.__file__).parents[2]
+    run = subprocess.run(
+        [sys.executable, "-c", FORKED],
+        cwd=package_parent,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
     assert run.returncode == 0, run.stderr[-2000:]
     return run.stdout.splitlines()
 
