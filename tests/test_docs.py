@@ -346,7 +346,9 @@ def generator() -> ModuleType:
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
+    path = list(sys.path)
     spec.loader.exec_module(module)
+    sys.path[:] = path  # generate.py adds the checkout, whose core may not be compiled
     return module
 
 
