@@ -471,6 +471,23 @@ def mega_table(found: Sequence[Mapping[str, Any]]) -> str:
     return table(rows)
 
 
+# Comparisons of docs/results.md whose tables show all keys of their rows but these: title, text
+COMPARISONS = {
+    "people": (
+        "People from a few images",
+        "Networks trained on synthetic people (`dyngs data synth people`), one thread, PSNR in the\n"
+        "box of the person on white (`benchmarks/compare_people.py`).",
+    ),
+    "scales": (
+        "Scales of images",
+        "Trained at one scale (1x), tested at several (`benchmarks/scales.py`); PSNR in dB.",
+    ),
+    "triangles": (
+        "Triangles and Gaussians",
+        "Equal minutes and numbers of learned values, one thread (`benchmarks/triangles.py`).",
+    ),
+}
+HIDDEN = ("commit", "command")
 MOVING_ID = "moving-scenes-at-equal-minutes"
 SOURCES = {"code": "", "paper": "", "second": " (second hand)", "unverified": " (unverified)"}
 
@@ -485,6 +502,16 @@ class OwnFigure:
     command: str
 
 
+def plain_table(found: Sequence[Mapping[str, Any]]) -> str:
+    """Return a Markdown table of rows with the same keys, without ``HIDDEN``."""
+    head = [key for key in found[0] if key not in HIDDEN]
+    rows = [head]
+    for row in found:
+        values = [row.get(key) for key in head]
+        rows.append([number(v) if v is None or isinstance(v, float) else str(v) for v in values])
+    return table(rows)
+
+
 def load_rows(path: Path) -> list[dict[str, Any]]:
     """Return the stored rows of a comparison; none if there is no file."""
     return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
@@ -496,10 +523,13 @@ def chosen_rows(system: Mapping[str, Any]) -> list[OwnFigure]:
     for name, wanted in system.get("rows", {}).items():
         for row in load_rows(RESULTS / f"comparisons/{name}.json"):
             if all(row[key] == value for key, value in wanted.items()):
-                size = row.get("stored_mb", row["mb"])
-                figure = f"{row['capture']} {row['psnr']:.2f}, {size:.2f} MB"
-                protocol = f"[tables](#{name})"
-                found.append(OwnFigure(figure, protocol, row["commit"], system["command"]))
+                figure = f"{row['capture']} {row['psnr']:.2f}"
+                if "mb" in row:
+                    figure += f", {row.get('stored_mb', row['mb']):.2f} MB"
+                title = COMPARISONS[name][0] if name in COMPARISONS else name
+                protocol = f"[tables](#{title.lower().replace(' ', '-')})"
+                command = row.get("command", system.get("command"))
+                found.append(OwnFigure(figure, protocol, row["commit"], command))
     return found
 
 
@@ -602,6 +632,10 @@ def systems_page(results: Mapping[str, Result], moving: Sequence[Mapping[str, An
             "\n## MEGA\n\nEach part is added to those before, at equal steps; the last run is stored as\n"
             f"files. Parts: [motion](concepts/motion.md#compact-models-mega).\n\n{mega_table(parts)}\n"
         )
+    for name, (title, note) in COMPARISONS.items():
+        found = load_rows(RESULTS / f"comparisons/{name}.json")
+        if found:
+            text += f"\n## {title}\n\n{note}\n\n{plain_table(found)}\n"
     return text
 
 
