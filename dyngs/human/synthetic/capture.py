@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import colorsys
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -27,7 +28,7 @@ from dyngs.data.read import PEOPLE_FILE
 from dyngs.data.synthetic.captures import CAMERA_ANGLE_X
 from dyngs.human.body.body import BodyTemplate, apply_shape, posed_vertices
 from dyngs.human.body.body_reader import default_template
-from dyngs.human.body.joints import JOINT_NAMES
+from dyngs.human.body.joints import JOINT_NAMES, mirrored_joints
 from dyngs.human.body.mesh import Fragments, interpolate, normalized, rasterize, vertex_normals
 from dyngs.human.motion.amass import write_amass
 from dyngs.human.motion.motion import Motion
@@ -174,6 +175,26 @@ _PARTS = {
 }
 """Joints of each body part, without side and number."""
 _SHORTS_HEM = -0.36  # height of the hem of shorts in T-pose, m
+_WAIST = 0.18  # height of the upper edge of trousers and skirts in T-pose, m
+_HEMS = ((_WAIST, _WAIST), (0.0, 0.12), (-0.2, 0.05), (-0.6, -0.2))
+"""Ranges of the lower edge of shirts in trousers, loose shirts, jackets and dresses, m."""
+_CUTS = {
+    "pitch": (0.2, 2.5),
+    "shirt": (0.005, 0.04),
+    "trousers": (0.005, 0.05),
+    "hair": (0.005, 0.04),
+    "folds": (10.0, 30.0),
+    "size": (0.88, 1.04),
+    "flare": (-0.2, 1.2),
+    "opening": (-0.4, 0.4),
+    "neckline": (0.0, 0.12),
+    "shoes": (0.005, 0.015),
+    "hairline": (0.0, 0.05),
+    "long_hair": (-0.3, 0.3),
+    "logo": (-0.1, 0.06),
+    "checks": (-0.5, 0.35),
+}
+"""Ranges of random cuts; a negative value means 0."""
 
 
 @dataclass(frozen=True)
@@ -190,32 +211,44 @@ class Outfit:
     hair: float = 0.0
     folds: float = 20.0  # spatial frequency, radians per metre
     size: float = 1.0  # of the person, relative to the template
+    hem: float = _WAIST  # height of the lower edge of the shirt, jacket, dress or skirt, m
+    flare: float = 0.0  # widening of the skirt per metre below the waist
+    opening: float = 0.0  # slope of the edges of an open jacket
+    neckline: float = 0.0  # radius, m
+    shoes: float = 0.0  # offset from the skin, m
+    hairline: float = -0.02  # hair behind this z reaches the nape, m
+    long_hair: float = 0.0  # length below the nape, m
+    logo: float = 0.05  # radius, m
+    checks: float = 0.35  # contrast of the checks of trousers
+    grain: np.ndarray | None = None  # (W, 4) wave vectors, rad/m, and phases of fine texture
 
 
 def random_outfit(seed: int, is_everyday: bool = False) -> Outfit:
     """Return the outfit of ``seed``; 0 is the painted template without clothes.
 
-    Clothes differ in cut and pattern, with offsets up to 4 cm; people are 0.88 to 1.04 times as
-    tall as the template. With ``is_everyday`` both sides, front and back mostly match and hands
-    are bare; else all differ, so that mix-ups are visible.
+    Clothes differ in cut and pattern, with offsets up to 5 cm, and include jackets and dresses;
+    people are 0.88 to 1.04 times as tall as the template. With ``is_everyday`` both sides, front
+    and back mostly match and hands are bare; else all differ, so that mix-ups are visible.
     """
     palette = _palette(seed)
-    if is_everyday:
-        palette = _everyday_palette(palette, np.random.default_rng([seed, 4]))
     if seed == 0:
         return Outfit(palette)
     generator = np.random.default_rng([seed, 1])
+    cuts = {name: max(0.0, float(generator.uniform(*ends))) for name, ends in _CUTS.items()}
+    hem = float(generator.uniform(*_HEMS[generator.integers(len(_HEMS))]))
+    if is_everyday:
+        palette = _everyday_palette(palette, np.random.default_rng([seed, 4]))
+    if hem < _HEMS[2][0]:
+        cuts["trousers"] = 0.0
+        palette |= {f"{side}_leg": palette["skin"] for side, _ in _SIDES}
     return Outfit(
         palette,
-        pitch=float(generator.uniform(0.7, 2.5)),
         vertical_stripes=bool(generator.uniform() < 0.5),
         long_sleeves=bool(generator.uniform() < 0.5),
         long_legs=bool(generator.uniform() < 0.7),
-        shirt=float(generator.uniform(0.005, 0.04)),
-        trousers=float(generator.uniform(0.005, 0.04)),
-        hair=float(generator.uniform(0.005, 0.04)),
-        folds=float(generator.uniform(10.0, 30.0)),
-        size=float(generator.uniform(0.88, 1.04)),
+        hem=hem,
+        grain=generator.normal(size=(24, 4)) * np.exp(generator.uniform(2.0, 5.5, (24, 1))),
+        **cuts,
     )
 
 
@@ -223,9 +256,60 @@ def dress_body(body: BodyTemplate, outfit: Outfit) -> BodyTemplate:
     """Return ``body`` with the clothes as part of its surface; joints, weights and UV map stay the
     same."""
     vertices = body.vertices.double().cpu().numpy()
-    offsets = _cloth_offsets(vertices, _part_weights(body), _left_eye(body), outfit)
+    x, y, z = vertices.T
+    eye = _left_eye(body)
+    weight = dict(zip(_PARTS, _part_weights(body).T, strict=True))
+    waist = _smoothstep((y - 0.1) / 0.08)
+    below = _smoothstep((_SHORTS_HEM - y) / 0.06)
+    sleeves = weight["arm"] + (weight["forearm"] if outfit.long_sleeves else 0.0)
+    ankle = weight["shoe"] * _smoothstep((y + 0.76) / 0.03)
+    legs = (weight["leg"] + ankle) * (1.0 if outfit.long_legs else 1.0 - below) + weight[
+        "torso"
+    ] * (1.0 - waist)
+    legs = legs * _smoothstep(np.abs(x) / 0.05) * (0.5 + 0.5 * _smoothstep(-y / 0.6))
+    scalp = weight["head"] * np.maximum(
+        _smoothstep((y - eye[1] - 0.03) / 0.04), _smoothstep((outfit.hairline - z) / 0.04)
+    )
+    scalp = scalp * _smoothstep((y - eye[1] + 0.1) / 0.06)
+    folds = 0.8 + 0.2 * np.sin(outfit.folds * (y + 0.5 * x) + 4.0 * np.arctan2(z, np.abs(x) - 0.1))
+    offsets = (
+        folds * (outfit.shirt * (weight["torso"] * waist + sleeves) + outfit.trousers * legs)
+        + outfit.hair * scalp
+        + outfit.shoes * weight["shoe"]
+    )
     clothed = vertices + offsets[:, None] * vertex_normals(vertices, body.faces.cpu().numpy())
-    return replace(body, vertices=torch.from_numpy(clothed).to(body.vertices))
+    falling = outfit.long_hair * scalp * _smoothstep((eye[1] + 0.05 - y) / 0.1)
+    clothed -= falling[:, None] * np.array([0.0, 1.0, 0.3])
+    is_covered = (weight["leg"] + weight["torso"] > 0.5) & (y > outfit.hem)
+    clothed, weights = _with_skirt(clothed, body.weights.double().cpu().numpy(), is_covered, outfit)
+    return replace(
+        body,
+        vertices=torch.from_numpy(clothed).to(body.vertices),
+        weights=torch.from_numpy(weights).to(body.weights),
+    )
+
+
+def _with_skirt(
+    vertices: np.ndarray, weights: np.ndarray, is_covered: np.ndarray, outfit: Outfit
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return vertices (M, 3) and joint weights (M, J) with the covered part of the legs closed.
+
+    Both legs are mapped to half elliptic cylinders that meet between them. Weights are mixed with
+    those of the other leg so that the halves still meet in other poses.
+    """
+    x, y, z = vertices.T
+    hips = vertices[is_covered & (y < 0.25)]
+    middle = 0.5 * (hips.max(axis=0) + hips.min(axis=0))
+    radius = hips.max(axis=0) - middle
+    angle = 0.65 * np.arctan2(z - middle[2], np.abs(x) - 0.6 * radius[0])
+    angle = angle.clip(-1.6, 1.6)  # the halves overlap by a few millimetres
+    widening = 1.05 + outfit.flare * (1.0 + 0.3 * np.sin(outfit.folds * angle)) * (_WAIST - y)
+    around = np.stack([np.sign(x) * np.cos(angle), 0.0 * y, np.sin(angle)], axis=-1)
+    shift = middle + radius * widening[:, None] * around - vertices
+    shift[:, 1] = 0.0
+    share = (is_covered * _smoothstep((_WAIST - y) / 0.15))[:, None]
+    other = weights[:, list(mirrored_joints(len(JOINT_NAMES)))] - weights
+    return vertices + share * shift, weights + share * (0.5 - 0.5 * np.cos(angle))[:, None] * other
 
 
 def paint_texture(body: BodyTemplate, outfit: Outfit, resolution: int = 512) -> np.ndarray:
@@ -287,30 +371,6 @@ def _part_weights(body: BodyTemplate) -> np.ndarray:
     return body.weights.double().cpu().numpy() @ member
 
 
-def _cloth_offsets(
-    vertices: np.ndarray, part_weights: np.ndarray, eye: np.ndarray, outfit: Outfit
-) -> np.ndarray:
-    """Return the offsets (M,) of clothes and hair from the skin along the normal, m."""
-    x, y, z = vertices.T
-    weight = dict(zip(_PARTS, part_weights.T, strict=True))
-    waist = _smoothstep((y - 0.1) / 0.08)
-    below = _smoothstep((_SHORTS_HEM - y) / 0.06)
-    sleeves = weight["arm"] + (weight["forearm"] if outfit.long_sleeves else 0.0)
-    legs = weight["leg"] * (1.0 if outfit.long_legs else 1.0 - below) + weight["torso"] * (
-        1.0 - waist
-    )
-    legs = legs * _smoothstep(np.abs(x) / 0.05) * (0.5 + 0.5 * _smoothstep(-y / 0.6))
-    scalp = weight["head"] * np.maximum(
-        _smoothstep((y - eye[1] - 0.03) / 0.04), _smoothstep((-0.02 - z) / 0.04)
-    )
-    scalp = scalp * _smoothstep((y - eye[1] + 0.1) / 0.06)
-    folds = 0.8 + 0.2 * np.sin(outfit.folds * (y + 0.5 * x) + 4.0 * np.arctan2(z, np.abs(x) - 0.1))
-    return (
-        folds * (outfit.shirt * (weight["torso"] * waist + sleeves) + outfit.trousers * legs)
-        + outfit.hair * scalp
-    )
-
-
 def _smoothstep(x: np.ndarray) -> np.ndarray:
     x = x.clip(0.0, 1.0)
     return x * x * (3.0 - 2.0 * x)
@@ -354,7 +414,7 @@ def _everyday_palette(
     Half of the shirts have one colour, colours are less saturated, and one shirt in five has a
     different back.
     """
-    names = ("shirt", "stripe", "back", "left_leg", "left_shoe")
+    names = ("shirt", "stripe", "back", "left_leg", "left_shoe", "hair")
     muted = {
         name: generator.uniform(0.25, 1.1)
         * (palette[name] + generator.uniform(0.0, 1.5) * 0.5)
@@ -367,7 +427,6 @@ def _everyday_palette(
     if generator.uniform() < 0.8:
         muted["back"] = muted["shirt"]
     sides = {f"right_{part}": muted[f"left_{part}"] for part in ("leg", "shoe")}
-    muted["cuff"] = muted["stripe"]
     return palette | muted | sides | {f"{side}_hand": palette["skin"] for side in ("left", "right")}
 
 
@@ -384,52 +443,43 @@ def _painted(points: np.ndarray, part: np.ndarray, eye: np.ndarray, outfit: Outf
     def either(name: str) -> np.ndarray:
         return np.where(is_left[:, None], palette[f"left_{name}"], palette[f"right_{name}"])
 
-    def striped(
-        along: np.ndarray, width: float, first: np.ndarray, second: np.ndarray
-    ) -> np.ndarray:
-        return np.where((np.floor(along / (width * pitch)) % 2 == 0)[:, None], first, second)
-
-    def disc(center_x: float, center_y: float, radius: float) -> np.ndarray:
-        return is_front & (np.hypot(x - center_x, y - center_y) < radius)
-
     rgb = np.broadcast_to(palette["skin"], points.shape).copy()
     is_head, is_torso, is_leg = (part == name for name in ("head", "torso", "leg"))
     white = np.full(3, 0.95)
     black = np.full(3, 0.08)
     red = np.array([0.75, 0.1, 0.1])
-    shirt = palette["shirt"]
-    stripe = palette["stripe"]
-    back = palette["back"]
-    checks = 0.65 + 0.35 * ((np.floor(y / (0.06 * pitch)) + np.floor(z / (0.06 * pitch))) % 2)
-    trousers = checks[:, None] * either("leg")
-    ahead, behind = (x, y) if outfit.vertical_stripes else (y, x)
-    torso = np.where(
-        is_front[:, None], striped(ahead, 0.05, shirt, stripe), striped(behind, 0.06, back, stripe)
-    )
-    sleeves = np.where(
-        is_left[:, None],
-        striped(side, 0.05, shirt, stripe),
-        striped(side, 0.08, back, palette.get("cuff", white)),
-    )
+    is_dark = np.floor(points[:, 1:] / (0.06 * pitch)).sum(axis=1, keepdims=True) % 2
+    trousers = (1.0 - outfit.checks * is_dark) * either("leg")
     is_sleeve = (part == "arm") | ((part == "forearm") & outfit.long_sleeves)
-    is_leg = is_leg & (outfit.long_legs | (y > _SHORTS_HEM))
+    is_main = np.where(is_sleeve, is_left, is_front)
+    along = np.where(is_sleeve, side, np.where(is_front == outfit.vertical_stripes, x, y))
+    is_stripe = np.floor(along / (0.05 * pitch)) % 2 == 1
+    cloth = np.where(is_main[:, None], palette["shirt"], palette["back"])
+    cloth[is_stripe] = palette["stripe"]
     for where, colors in (
-        (is_torso, torso),
-        (is_torso & disc(0.09, 0.47, 0.05), white),
-        (is_torso & (y < 0.18), black),
-        (is_leg | (is_torso & (y < 0.14)), trousers),
-        (is_sleeve, sleeves),
-        ((part == "forearm") & is_left & (np.abs(side - 0.62) < 0.03), black),
+        (is_torso | is_sleeve, cloth),
+        (is_torso & is_front & (np.hypot(x - 0.09, y - 0.47) < outfit.logo), white),
+        (is_torso & is_front & (side < outfit.opening * (y - 0.25)), white),
+        (is_torso & (np.hypot(x, y - eye[1] + 0.14) < outfit.neckline), palette["skin"]),
+        (is_torso & (y < _WAIST), black),
+        (is_torso & (y < 0.14), trousers),
+        (is_leg & (outfit.long_legs | (y > _SHORTS_HEM)), trousers),
+        ((is_torso | is_leg) & (y < _WAIST) & (y > outfit.hem), cloth),
         (part == "hand", either("hand")),
         (part == "shoe", either("shoe")),
-        (is_head & ((y > eye[1] + 0.05) | (~is_front & (y > eye[1] - 0.06))), palette["hair"]),
-        (is_head & (disc(eye[0], eye[1], 0.02) | disc(-eye[0], eye[1], 0.02)), black),
+        (
+            is_head & ((y > eye[1] + 0.05) | ((z < outfit.hairline) & (y > eye[1] - 0.06))),
+            palette["hair"],
+        ),
+        (is_head & (np.hypot(side - eye[0], y - eye[1]) < 0.012) & is_front, black),
         (part == "eye", white),
         (is_head & (np.hypot(x / 2.5, y - eye[1] + 0.075) < 0.011) & (z > 0.05), red),
-        (is_head & disc(eye[0] + 0.012, eye[1] - 0.042, 0.014), palette["left_hand"]),
     ):
         rgb[where] = colors[where] if colors.ndim == 2 else colors
-    return rgb
+    if outfit.grain is not None:
+        waves = np.sin(points @ outfit.grain[:, :3].T + outfit.grain[:, 3]).mean(axis=1)
+        rgb *= 1.0 + 0.5 * waves[:, None]
+    return rgb.clip(0.0, 1.0)
 
 
 _RADIUS = 3.5  # radius of the ring of cameras, m
@@ -439,12 +489,15 @@ _TARGET = np.array([0.0, 0.95, 0.0])  # point that all cameras look at, m
 
 @dataclass(frozen=True)
 class DirectionalLight:
-    """Directional light plus ambient light."""
+    """Directional light plus ambient light and the light of a sky."""
 
     direction: tuple[float, float, float] = (0.35, 0.75, 0.56)  # towards the light, not normalised
     # factors on sRGB values, one or three; a surface facing the light receives ambient + diffuse
     ambient: tuple[float, ...] = (0.6,)
     diffuse: tuple[float, ...] = (0.45,)
+    # (9, 1 or 3) factors of the quadratic polynomial of the normal n that is added: of n, its
+    # squares and its products (Ramamoorthi and Hanrahan 2001)
+    sky: Sequence[Sequence[float]] = ((0.0,),) * 9
 
 
 @dataclass(frozen=True)
@@ -464,6 +517,7 @@ class HumanOptions:
     scene_seed: int | None = None
     everyday_clothes: bool = False  # see ``random_outfit``
     with_depth: bool = False  # write depth maps
+    body_error: float = 0.0  # standard deviation of errors of the written shape parameters
 
 
 @dataclass(frozen=True)
@@ -498,6 +552,8 @@ def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Pa
     outfit, clothed, texture = _dressed(body, options.seed, options.everyday_clothes)
     train, test = ring_cameras(options)
     light = random_light(options.scene_seed)
+    error = np.random.default_rng([options.seed, 7]).normal(0, options.body_error, betas.shape)
+    betas = betas + torch.from_numpy(error).to(betas)
     clips = {"train": (options.num_frames, {"train": train, "test": test})}
     if options.num_pose_frames and test:
         clips["pose"] = options.num_pose_frames, {"pose": test}
@@ -548,12 +604,13 @@ def random_light(seed: int | None) -> DirectionalLight:
     height = generator.uniform(0.0, 1.2)
     diffuse = generator.uniform(0.2, 0.6)
     ambient = generator.uniform(0.75, 1.05) - diffuse
-    tint = 1.0 + generator.uniform(-0.06, 0.06) * np.array([1.0, 0.0, -1.0])
-    red, green, blue = (float(diffuse * part) for part in tint)
+    sky = generator.normal(0.0, 0.07, (9, 1)) + generator.normal(0.0, 0.02, (9, 3))
+    sky[3:6] += generator.uniform(0.1, 0.3)  # the squares sum to 1
     return DirectionalLight(
         (float(np.sin(azimuth)), float(height), float(np.cos(azimuth))),
         (float(ambient),),
-        (red, green, blue),
+        (float(diffuse),),
+        sky.tolist(),
     )
 
 
@@ -672,7 +729,7 @@ def ring_cameras(options: HumanOptions) -> tuple[dict[int, np.ndarray], dict[int
         test = _on_ring(test_fractions, np.full(num_test, 1.3))
     else:
         generator = np.random.default_rng([options.scene_seed, 5])
-        radius = generator.uniform(3.3, 4.2)
+        radius = generator.uniform(3.0, 4.2)
         height = generator.uniform(0.7, 1.6)
         train = _on_ring(
             train_fractions,
@@ -706,7 +763,8 @@ def _shaded(mesh: PosedMesh, fragments: Fragments, light: DirectionalLight) -> n
     )
     facing = np.maximum(normal @ normalized(np.array(light.direction)), 0.0)
     received = np.array(light.ambient) + np.array(light.diffuse) * facing[:, None]
-    return np.minimum(_sampled(mesh.texture, uv) * received, 1.0)
+    terms = np.hstack([normal, normal**2, normal * np.roll(normal, 1, axis=1)])
+    return (_sampled(mesh.texture, uv) * (received + terms @ np.array(light.sky))).clip(0.0, 1.0)
 
 
 def _sampled(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
@@ -733,6 +791,7 @@ class PeopleOptions:
     cameras: int = 24  # on a ring around each person
     frames: int = 1  # per person
     seed: int = 0  # different seeds share no body, outfit, motion, light or camera ring
+    body_error: float = 0.4  # see ``HumanOptions``; bodies of captures are estimates, too
 
 
 def write_people(
@@ -788,6 +847,7 @@ def person_options(options: PeopleOptions, number: int) -> HumanOptions:
         seed=seed,
         body_seed=seed,
         scene_seed=seed,
-        everyday_clothes=number % 2 == 1,
+        everyday_clothes=number % 4 > 0,
         with_depth=True,
+        body_error=options.body_error,
     )

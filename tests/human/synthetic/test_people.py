@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -12,8 +14,23 @@ from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import list_captures
-from dyngs.human.synthetic.capture import PeopleOptions, write_people
+from dyngs.human.body.body import posed_vertices
+from dyngs.human.body.body_reader import default_template
+from dyngs.human.body.joints import JOINT_NAMES
+from dyngs.human.synthetic.capture import (
+    DirectionalLight,
+    PeopleOptions,
+    PosedMesh,
+    dress_body,
+    person_options,
+    random_outfit,
+    render_mesh,
+    texture_coordinates,
+    write_human_capture,
+    write_people,
+)
 
+HEIGHTS = {"chest": 0.4, "knee": -0.28, "shin": -0.55}  # in T-pose, m
 SMALL = PeopleOptions(people=2, size=64, cameras=3)
 
 
@@ -86,3 +103,75 @@ def test_mismatched_options_are_refused(root: Path, tmp_path: Path) -> None:
         with pytest.raises(DyngsError, match=">= 1"):
             write_people(tmp_path / "new", bad)
     assert not (tmp_path / "new").exists()
+
+
+def test_a_skirt_closes_the_gap_between_the_legs_in_every_pose() -> None:
+    body = default_template()
+    trousers = replace(random_outfit(1), hem=0.18)
+    skirt = replace(trousers, hem=-0.35, flare=0.3)
+    poses = torch.zeros(1, len(JOINT_NAMES), 3)
+    poses[0, JOINT_NAMES.index("left_hip"), 2] = 0.3  # legs apart
+    poses[0, JOINT_NAMES.index("right_hip"), 2] = -0.3
+    camera = np.eye(4)
+    camera[2, 3] = 3.5
+    shown = []
+    for outfit in (trousers, skirt):
+        clothed = dress_body(body, outfit)
+        torch.testing.assert_close(clothed.weights.sum(1), torch.ones(len(clothed.weights)))
+        vertices = posed_vertices(clothed, poses, torch.zeros(1, 3))[0].double().numpy()
+        uv, uv_faces = texture_coordinates(body)
+        mesh = PosedMesh(vertices, body.faces.numpy(), uv, uv_faces, np.ones((4, 4, 3)))
+        shown.append(render_mesh(mesh, camera, 128, 1)[..., 3] > 0)
+    rows = {name: 64 + round(-y * 0.5 * 128 / np.tan(0.3456) / 3.5) for name, y in HEIGHTS.items()}
+    assert not shown[0][rows["knee"], 64]
+    assert shown[1][rows["chest"] : rows["knee"], 64].all()
+    wide = np.flatnonzero(shown[1][rows["knee"]])
+    assert (np.diff(wide) == 1).all(), "one closed shape"
+    assert shown[1][rows["knee"]].sum() > 1.3 * shown[0][rows["knee"]].sum()
+    below = rows["shin"]
+    np.testing.assert_array_equal(shown[1][below], shown[0][below])
+
+
+def test_clothes_hair_and_light_differ_between_people() -> None:
+    outfits = [random_outfit(seed, is_everyday=True) for seed in range(1, 41)]
+    skirts = [outfit for outfit in outfits if outfit.hem < -0.2]
+    assert 4 <= len(skirts) <= 16
+    assert 10 <= sum(outfit.long_hair > 0.05 for outfit in outfits) <= 25
+    body = default_template()
+    long_haired = replace(outfits[0], long_hair=0.3)
+    heads = [dress_body(body, replace(long_haired, long_hair=x)).vertices for x in (0.0, 0.3)]
+    lowered = (heads[0] - heads[1])[:, 1]
+    assert float(lowered.min()) >= 0
+    assert 0.2 < float(lowered.max()) <= 0.3
+    assert 20 < int((lowered > 0.05).sum()) < 1000
+
+
+def test_the_sky_adds_a_quadratic_polynomial_of_the_normal() -> None:
+    """Flat triangle that faces the camera: n = (0, 0, 1), so that n_z and n_z^2 are 1."""
+    corners = np.array([[-9.0, -9, 0], [9, -9, 0], [0, 9, 0]])
+    faces = np.array([[0, 1, 2]])
+    mesh = PosedMesh(corners, faces, np.full((3, 2), 0.5), faces, np.full((2, 2, 3), 0.5))
+    sky = np.zeros((9, 3))
+    sky[2] = 0.1, 0.2, 0.3
+    sky[5] = 0.4
+    sky[[0, 1, 3, 4, 6, 7, 8]] = 9.0
+    camera = np.eye(4)
+    camera[2, 3] = 3.5
+    light = DirectionalLight(ambient=(0.2,), diffuse=(0.0,), sky=sky.tolist())
+    rgb = render_mesh(mesh, camera, 8, 1, light)[4, 4, :3]
+    np.testing.assert_allclose(rgb, 0.5 * (0.2 + 0.4 + np.array([0.1, 0.2, 0.3])), atol=1e-9)
+
+
+def test_bodies_have_errors_but_the_images_are_those_of_the_exact_body(tmp_path: Path) -> None:
+    options = person_options(PeopleOptions(size=32, cameras=1), 1)
+    roots = [
+        write_human_capture(tmp_path / str(error), replace(options, body_error=error))
+        for error in (0.0, 0.5)
+    ]
+    exact, estimated = (np.load(root / "body_train.npz") for root in roots)
+    error = estimated["betas"] - exact["betas"]
+    assert 0.3 < error.std() < 0.7
+    np.testing.assert_array_equal(exact["poses"], estimated["poses"])
+    np.testing.assert_array_equal(exact["trans"], estimated["trans"])
+    images = [contents(root / "images") for root in roots]
+    assert images[0] == images[1]
