@@ -226,17 +226,18 @@ class Outfit:
 def random_outfit(seed: int, is_everyday: bool = False) -> Outfit:
     """Return the outfit of ``seed``; 0 is the painted template without clothes.
 
-    Clothes differ in cut and pattern, with offsets up to 5 cm, and include jackets and dresses;
-    people are 0.88 to 1.04 times as tall as the template. With ``is_everyday`` both sides, front
-    and back mostly match and hands are bare; else all differ, so that mix-ups are visible.
+    Clothes differ in cut and pattern, with offsets up to 5 cm; people are 0.88 to 1.04 times as
+    tall as the template. With ``is_everyday`` both sides, front and back mostly match, hands are
+    bare, and some wear jackets or dresses; else all differ, so that mix-ups are visible.
     """
     palette = _palette(seed)
     if seed == 0:
         return Outfit(palette)
     generator = np.random.default_rng([seed, 1])
     cuts = {name: max(0.0, float(generator.uniform(*ends))) for name, ends in _CUTS.items()}
-    hem = float(generator.uniform(*_HEMS[generator.integers(len(_HEMS))]))
+    hem = _WAIST
     if is_everyday:
+        hem = float(generator.uniform(*_HEMS[generator.integers(len(_HEMS))]))
         palette = _everyday_palette(palette, np.random.default_rng([seed, 4]))
     if hem < _HEMS[2][0]:
         cuts["trousers"] = 0.0
