@@ -105,16 +105,31 @@ def posed_vertices(
         betas: (B,) or (F, B) shape parameters.
         scale: (F,) uniform scale.
     """
-    vertices, joints = apply_shape(body, betas)
-    rotations = axis_angle_to_matrix(poses)
-    if body.pose_dirs is not None:
-        features = rotations[:, 1:] - torch.eye(3, dtype=poses.dtype, device=poses.device)
-        vertices = vertices + (features.flatten(1) @ body.pose_dirs).unflatten(-1, (-1, 3))
-    transforms = joint_transforms(joints, body.parents, rotations)
-    posed = apply_transforms(blend_transforms(body.weights, transforms), vertices)
+    posed, _ = skin(body, *apply_shape(body, betas), axis_angle_to_matrix(poses))
     if scale is not None:
         posed = scale[:, None, None] * posed
     return posed + trans[:, None]
+
+
+def skin(
+    body: BodyTemplate, vertices: Tensor, joints: Tensor, rotations: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return posed vertices (..., M, 3) and joints (..., J, 3), before scale and translation;
+    differentiable.
+
+    Args:
+        body: the template, whose shape space is not used.
+        vertices: (..., M, 3) in the rest pose.
+        joints: (..., J, 3) in the rest pose.
+        rotations: (..., J, 3, 3) relative to the parent joint.
+    """
+    if body.pose_dirs is not None:
+        one = torch.eye(3, dtype=rotations.dtype, device=rotations.device)
+        features = (rotations[..., 1:, :, :] - one).flatten(-3)
+        vertices = vertices + (features @ body.pose_dirs).unflatten(-1, (-1, 3))
+    transforms = joint_transforms(joints, body.parents, rotations)
+    posed = apply_transforms(blend_transforms(body.weights, transforms), vertices)
+    return posed, apply_transforms(transforms, joints)
 
 
 BONE_UNIT = 0.015

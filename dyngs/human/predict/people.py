@@ -8,12 +8,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import combinations_with_replacement
 from typing import Any
 
 import numpy as np
 import torch
+from scipy.ndimage import maximum_filter
 from scipy.spatial import KDTree
-from torch import Tensor
+from torch import Tensor, get_num_threads
 from torch.nn.functional import grid_sample, pad
 
 from dyngs.config import DataConfig
@@ -24,10 +26,9 @@ from dyngs.data.capture import Capture, View
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.human.avatar.posing import BodyPose, frame_pose
-from dyngs.human.body.body import BodyTemplate
+from dyngs.human.body.body import BodyTemplate, skin
 from dyngs.human.body.body_reader import rest_shape
 from dyngs.human.body.mesh import vertex_normals
-from dyngs.human.body.skinning import apply_transforms, blend_transforms, joint_transforms
 from dyngs.human.motion.motion import CapturedMotion, captured_motion
 from dyngs.human.predict.gps.rectification import crop_image, crop_to_person
 from dyngs.ops.device import CPU
@@ -63,15 +64,21 @@ class PosedBody:
         vertices = self.vertices.double().cpu().numpy()
         reach = DILATION + _CELL
         low = vertices.min(axis=0) - reach
-        size = np.ceil((vertices.max(axis=0) + reach - low) / _CELL)
-        centres = low + _CELL * (np.moveaxis(np.indices(size.astype(int)), 0, -1) + 0.5)
-        distance, nearest = KDTree(vertices).query(centres, distance_upper_bound=reach)
+        size = np.ceil((vertices.max(axis=0) + reach - low) / _CELL).astype(int)
+        occupied = np.zeros(size, dtype=bool)
+        occupied[tuple(((vertices - low) / _CELL).astype(int).T)] = True
+        # Most cells are far from the body, and searching near it alone takes a third of the time.
+        cells = np.argwhere(maximum_filter(occupied, 2 * round(reach / _CELL) + 1))
+        centres = low + _CELL * (cells + 0.5)
+        search = KDTree(vertices).query
+        distance, nearest = search(centres, distance_upper_bound=reach, workers=get_num_threads())
         nearest = np.minimum(nearest, len(vertices) - 1)  # of cells out of reach
         outward = (centres - vertices[nearest]) * self._normals.double().cpu().numpy()[nearest]
-        is_inside = (outward.sum(-1) < 0) & (distance < reach)
-        height = np.where(is_inside, -distance, np.minimum(distance, reach))
+        signed = np.copysign(distance, outward.sum(-1))
+        heights = np.full(size, reach)
+        heights[tuple(cells.T)] = np.where(distance < reach, signed, reach)
         grid, low, size = (
-            torch.from_numpy(x).to(self.vertices) for x in (height, low, _CELL * size)
+            torch.from_numpy(x).to(self.vertices) for x in (heights, low, _CELL * size)
         )
         return grid[None, None], low, size
 
@@ -90,8 +97,9 @@ class PosedBody:
         """Return the depth map (H, W) of the body, m; infinite in the background."""
         return depths(self.vertices, self.faces, camera)
 
-    def interval(self, camera: Cameras) -> tuple[Tensor, Tensor, Tensor]:
-        """Return where the rays of a camera may hit the clothed surface, as depth maps (H, W), m.
+    def interval(self, camera: Cameras) -> Tensor:
+        """Return where the rays of a camera may hit the clothed surface, as depth maps (3, H, W),
+        m.
 
         The first depth is the entry into the dilated mesh; the last is the eroded mesh or the exit
         of the dilated mesh; the third is the body. Infinite where rays miss.
@@ -105,7 +113,7 @@ class PosedBody:
         eroded = depths(inner, self.faces, camera, front_faces=True)
         body_depth = self.depth(camera)
         end = torch.minimum(torch.maximum(eroded, body_depth + EROSION / 2), exit_depth)
-        return entry, torch.maximum(end, entry), body_depth
+        return torch.stack([entry, torch.maximum(end, entry), body_depth])
 
 
 @dataclass(frozen=True)
@@ -143,25 +151,16 @@ class Person:
         row = self.motion.rows[-1 if view.frame is None else view.frame]
         return frame_pose(self.motion.clip, row)
 
-    def posed(self, vertices: Tensor, pose: BodyPose) -> tuple[Tensor, Tensor]:
-        """Return posed vertices (M, 3) and joints (J, 3), before scale and translation."""
-        body = self.body
-        if body.pose_dirs is not None:
-            features = (pose.rotations[1:] - torch.eye(3, device=vertices.device)).flatten()
-            vertices = vertices + (features @ body.pose_dirs).unflatten(0, (-1, 3))
-        transforms = joint_transforms(body.joints, body.parents, pose.rotations)
-        posed = apply_transforms(blend_transforms(body.weights, transforms), vertices)
-        return posed, apply_transforms(transforms, body.joints)
-
     def body_in(self, view: View, device: torch.device = CPU) -> tuple[PosedBody, float]:
         """Return the body in the pose of ``view``, and the world units per metre; cached."""
         key = view.frame, device
         if key not in self._bodies:
             pose = self.pose_in(view)
-            vertices, joints = self.posed(self.body.vertices, pose)
+            body = self.body
+            vertices, joints = skin(body, body.vertices, body.joints, pose.rotations)
             shift = pose.trans / pose.scale
-            body = PosedBody(joints[:NUM_KEY_POINTS] + shift, vertices + shift, self.body.faces)
-            self._bodies[key] = move_fields_to(body, device), float(pose.scale)
+            posed = PosedBody(joints[:NUM_KEY_POINTS] + shift, vertices + shift, body.faces)
+            self._bodies[key] = move_fields_to(posed, device), float(pose.scale)
         return self._bodies[key]
 
 
@@ -207,21 +206,23 @@ def crop_source_images(images: Sequence[Image], scale: float) -> Sources:
     """Crop images to the person, in a world with ``scale`` units per metre, and pad them to one
     size."""
     crops = [crop_to_person(image, MARGIN) for image in images]
-    height, width = (
-        -(-max(getattr(crop.cameras, side) for crop in crops) // MULTIPLE) * MULTIPLE
-        for side in ("height", "width")
-    )
+    cameras = [cameras_in_metres(crop.cameras, scale) for crop in crops]
+    width = _padded(max(camera.width for camera in cameras))
+    height = _padded(max(camera.height for camera in cameras))
     rgba = []
     for crop in crops:
         assert crop.alpha is not None
         planes = torch.cat([crop.rgb_premultiplied, crop.alpha[..., None]], -1).permute(2, 0, 1)
         rgba.append(pad(planes, (0, width - planes.shape[2], 0, height - planes.shape[1])))
-    cameras = [cameras_in_metres(crop.cameras, scale) for crop in crops]
     return Sources(
         torch.stack(rgba),
         torch.cat([x.cam_from_world for x in cameras]),
         torch.cat([x.intrinsics for x in cameras]),
     )
+
+
+def _padded(side: int) -> int:
+    return -(-side // MULTIPLE) * MULTIPLE
 
 
 def crop_window(image: Image, left: int, top: int, side: int) -> Image:
@@ -268,15 +269,17 @@ def depths(
     farthest = 1 / _NEAREST + 1
     if last:  # a projective map that keeps pixels and planes and reverses the order of depths
         corners = corners / (farthest * corners[..., 2:] - 1)
-    a, b, c = corners.unbind(1)
     if front_faces:
+        a, b, c = corners.unbind(1)
         shown &= (a * torch.linalg.cross(b, c)).sum(-1) < 0
-    patches = torch.stack([a, (a + b) / 2, (a + c) / 2, b, (b + c) / 2, c], 1)[shown]
+    corners = corners[shown]
+    pairs = combinations_with_replacement(corners.unbind(1), 2)
+    patches = torch.stack([(one + other) / 2 for one, other in pairs], 1)
     own = replace(camera, cam_from_world=torch.eye(4, device=pose.device)[None])
     ids, uv = visible_patches(patches, own, 1e-3, segments=1)
     meets = ids[0] >= 0
     weights = torch.cat([uv, 1 - uv.sum(-1, keepdim=True)], -1)[0, meets]
-    depth = (patches[ids[0, meets].long()][:, [0, 3, 5], 2] * weights).sum(-1)
+    depth = (corners[ids[0, meets].long(), :, 2] * weights).sum(-1)
     if last:
         depth = depth / (farthest * depth - 1)
     image = uv.new_full(meets.shape, torch.inf)

@@ -98,10 +98,9 @@ class EgHumanNerf(FieldNetwork):
 
     def limits(self, person: EncodedPerson, camera: Cameras, z: Tensor) -> tuple[Tensor, Tensor]:
         """Values are start and end of the sampled interval, and the distance of the body, m."""
-        depths = torch.stack(person.body.interval(camera), -1).view(-1, 3)
-        limits = (depths / z[:, None]).clamp(NEAR, _FAR)
-        near, far, _ = limits.unbind(1)
-        return (far > near).nonzero()[:, 0], limits  # not where all are _FAR
+        limits = (person.body.interval(camera).flatten(1) / z).clamp(NEAR, _FAR)
+        near, far, _ = limits
+        return (far > near).nonzero()[:, 0], limits.T  # not where all are _FAR
 
     def render(
         self, person: EncodedPerson, camera: Cameras, generator: torch.Generator | None = None

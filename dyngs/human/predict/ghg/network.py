@@ -40,7 +40,7 @@ from dyngs.human.avatar.posing import BodyPose, Skeleton, pose_blend_shapes, tex
 from dyngs.human.avatar.scene import HumanScene, initial_human_scene
 from dyngs.human.avatar.training import HumanTraining
 from dyngs.human.body.atlas import Texels, atlas_texels
-from dyngs.human.body.body import BodyTemplate
+from dyngs.human.body.body import BodyTemplate, skin
 from dyngs.human.body.body_reader import load_template
 from dyngs.human.fit.fitted_capture import ensure_fitted_body
 from dyngs.human.keys import HumanModel, HumanPredictorModel
@@ -309,8 +309,9 @@ def _at_texels(person: AtlasPerson, values: Tensor) -> Tensor:
 
 def _posed_vertices(person: AtlasPerson, pose: BodyPose, height: float) -> Tensor:
     """Return the vertices (M, 3) of a scaffold in world coordinates."""
-    vertices = person.person.body.vertices + height * person.normals
-    posed, _ = person.person.posed(vertices, pose)
+    body = person.person.body
+    vertices = body.vertices + height * person.normals
+    posed, _ = skin(body, vertices, body.joints, pose.rotations)
     return pose.scale * posed + pose.trans
 
 
