@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, Generic, TypeVar
@@ -17,11 +17,13 @@ from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.capture import View
 from dyngs.data.loader import Image
+from dyngs.data.read import list_captures
+from dyngs.data.times import distinct_times
 from dyngs.models.checkpoint import CONFIG_ADVICE, Checkpoint
 from dyngs.models.model import Model
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import background_colour, evaluation_background
-from dyngs.ops.device import CPU, copy_async
+from dyngs.ops.device import CPU, copy_async, select_device
 from dyngs.ops.loss import l1_ssim_loss
 
 GROUPS = 8
@@ -137,10 +139,10 @@ class Predictor(ABC, Generic[N]):
     def run_config(self, views: Sequence[int]) -> Config:
         """Return the configuration of the run that the scene becomes, which training can refine."""
 
-    def data_at_time(self, time: float | None, times: Collection[float]) -> DataConfig:
-        """Return the options of the time step of the capture, at ``times``, that is nearest to
-        ``time``; None: as given."""
-        moments = sorted(set(times))
+    def data_at_time(self, time: float | None, views: Iterable[View]) -> DataConfig:
+        """Return the options of the time step of all ``views`` that is nearest to ``time``; None:
+        as given."""
+        moments = sorted(set(distinct_times(views).values()))
         if time is None or len(moments) < 2:
             return self.data
         row = min(range(len(moments)), key=lambda i: abs(moments[i] - time))
@@ -207,22 +209,31 @@ class Learner(ABC, Generic[N]):
         load_weights(self.network, checkpoint)
 
 
+class CaptureLearner(Learner[N], Generic[N, P]):
+    """Learner on captures that stay open: the last ``MOST_OPEN`` that were used."""
+
+    def __init__(self, config: Config, network: N) -> None:
+        people = list_captures(config.data)
+        device = select_device(config.run.device)
+        names = [person.root.name for person in people]
+        super().__init__(config, network.to(device), names, device)
+        self.opened = lru_cache(MOST_OPEN)(lambda person: self.open_person(people[person]))
+        self.opened(0)  # captures of another kind fail before training
+
+    @abstractmethod
+    def open_person(self, data: DataConfig) -> P:
+        """Read a capture. Raises DyngsError: it does not suit."""
+
+
 def random_index(count: int, generator: torch.Generator) -> int:
     """Return a random whole number below ``count``, the same on every device; ``generator`` is of
     the CPU."""
     return int(torch.randint(count, (1,), generator=generator, device="cpu"))
 
 
-def keep_captures_open(
-    open_person: Callable[[DataConfig], P], people: Sequence[DataConfig]
-) -> Callable[[int], P]:
-    """Return a function that opens the captures of people, of which the last ones stay open.
-
-    The first one is opened at once, so that captures of another kind fail before training.
-    """
-    opened = lru_cache(MOST_OPEN)(lambda person: open_person(people[person]))
-    opened(0)
-    return opened
+def random_item(items: Sequence[P], generator: torch.Generator) -> P:
+    """Return one of ``items``, see ``random_index``."""
+    return items[random_index(len(items), generator)]
 
 
 def load_weights(network: nn.Module, checkpoint: Checkpoint, part: str = "model.network") -> None:

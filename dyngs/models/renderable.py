@@ -361,6 +361,42 @@ def composite_background(
     return Rendering(rgb, transmittance, None if options.depth == "none" else depth)
 
 
+class RayScene(Renderable):
+    """Scene that is rendered one camera at a time, without gradients by cameras."""
+
+    @property
+    @abstractmethod
+    def example(self) -> Tensor:
+        """Any tensor of the scene; cameras are moved to its device and dtype."""
+
+    @property
+    def device(self) -> torch.device:
+        return self.example.device
+
+    @abstractmethod
+    def render_camera(
+        self, camera: Cameras, time: float, options: Any
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return colours on black (H, W, 3), transmittance (H, W) and the sum of weight times depth
+        (H, W) of one camera."""
+
+    def render(
+        self,
+        cameras: Cameras,
+        time: float | TimeStep | None = None,
+        *,
+        options: Any = None,
+        background: Tensor | None = None,
+    ) -> Rendering:
+        options = self.options if options is None else options
+        behind = self.background if background is None else background
+        now = time if isinstance(time, TimeStep) else self.time_step(time)
+        cameras = fixed_cameras(cameras, behind, self.example)
+        views = [self.render_camera(camera, now.time or 0.0, options) for camera in cameras]
+        rgb, through, depth = (torch.stack(x) for x in zip(*views, strict=True))
+        return composite_background(rgb, through, depth, options, behind)
+
+
 def check_background(background: Tensor | None, views: int) -> None:
     """Check the shape of a background: (3,) or (V, 3)."""
     if background is not None and tuple(background.shape) not in ((3,), (views, 3)):

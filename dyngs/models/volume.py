@@ -49,21 +49,22 @@ def camera_rays(cameras: Cameras, pixels: Tensor | None = None) -> tuple[Rays, T
 
 
 @torch.no_grad()
-def reached_samples(densities: Tensor, samples: Samples) -> tuple[Samples, Tensor]:
-    """Return the samples (K) that light gets to, and their indices (K,) among all."""
-    through, offsets = reached(densities, samples)
-    return _chosen(samples, through, offsets)
+def visible_samples(
+    densities: Tensor, samples: Samples, shifts: Tensor | None = None
+) -> tuple[Samples, Tensor]:
+    """Return the samples (K) that light gets to, and their indices (K,) among all.
 
+    With ``shifts``, faint ones are thinned to every fourth, four times as long around the same
+    midpoint. What rays see, and the gradients by densities, are on average those of all samples.
 
-@torch.no_grad()
-def thin_samples(densities: Tensor, samples: Samples, shifts: Tensor) -> tuple[Samples, Tensor]:
-    """Return the samples of ``reached_samples``, with faint ones thinned to every fourth, four
-    times as long around the same midpoint.
-
-    What rays see, and the gradients by densities, are on average those of all samples. ``shifts``
-    (R,) in [0, 1): which of four it is, at random for each ray.
+    Args:
+        densities: (M,) per world unit.
+        samples: M samples of R rays.
+        shifts: (R,) in [0, 1): which of four it is, at random for each ray; None: no thinning.
     """
-    through, _ = reached(densities, samples)
+    through, offsets = reached(densities, samples)
+    if shifts is None:
+        return _chosen(samples, through, offsets)
     weights = composite(densities, densities[:, None].expand(-1, 3).contiguous(), samples).weights
     place = (
         torch.arange(len(samples), device=densities.device)

@@ -36,7 +36,7 @@ from dyngs.data.capture import View
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import StartContext
 from dyngs.models.model import UpdateResult
-from dyngs.models.volume import reached_samples, thin_samples
+from dyngs.models.volume import visible_samples
 from dyngs.ops.device import copy_async
 from dyngs.ops.harmonics import harmonics_basis
 from dyngs.ops.hash_grid import HashLevels, hash_features, select_features
@@ -172,10 +172,8 @@ class NgpField(RadianceField):
         with torch.no_grad():  # selection of samples needs densities only
             features = hash_features(marched.coords, table, self.levels)
             densities = self._density(self._geometry(features, time), marched.coords)
-            if shifts is None:
-                samples, which = reached_samples(densities, marched)
-            else:
-                samples, which = thin_samples(densities, marched, shifts[:, 1])
+            thinned = None if shifts is None else shifts[:, 1]
+            samples, which = visible_samples(densities, marched, thinned)
         features = select_features(features, which, samples.coords, table, self.levels)
         geometry = self._geometry(features, time)
         basis = harmonics_basis(rays.directions, DIRECTION_DEGREE)

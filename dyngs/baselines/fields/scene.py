@@ -22,16 +22,7 @@ from dyngs.data.capture import Capture, View
 from dyngs.data.geometry import focus_point, fraction_in_front, invert_rigid
 from dyngs.data.scene_space import camera_extent
 from dyngs.models.checkpoint import Checkpoint
-from dyngs.models.renderable import (
-    DrawOptions,
-    Renderable,
-    Rendering,
-    Surface,
-    SurfaceOptions,
-    TimeStep,
-    composite_background,
-    fixed_cameras,
-)
+from dyngs.models.renderable import DrawOptions, RayScene, Surface, SurfaceOptions
 from dyngs.models.views import evaluation_background
 from dyngs.models.volume import camera_rays
 from dyngs.ops.perceptron import Layer, perceptron
@@ -188,7 +179,7 @@ def mlp(x: Tensor, weights: Sequence[Tensor]) -> Tensor:
 
 
 @dataclass(frozen=True, repr=False)
-class FieldScene(Renderable):
+class FieldScene(RayScene):
     """Scene of a radiance field.
 
     ``training_times``: distinct training times in [0, 1], ascending, of dynamic fields.
@@ -218,8 +209,8 @@ class FieldScene(Renderable):
         return torch.stack([centre - space.half, centre + space.half])
 
     @property
-    def device(self) -> torch.device:
-        return next(iter(self.field.parameters.values())).device
+    def example(self) -> Tensor:
+        return next(iter(self.field.parameters.values()))
 
     def state(self) -> State:
         space = self.field.space
@@ -229,29 +220,9 @@ class FieldScene(Renderable):
             own["times"] = torch.tensor(self.training_times, dtype=torch.float64, device="cpu")
         return add_prefix("field", with_role(own, Role.SHARED) | self.field.state())
 
-    def render(
-        self,
-        cameras: Cameras,
-        time: float | TimeStep | None = None,
-        *,
-        options: Any = None,
-        background: Tensor | None = None,
-    ) -> Rendering:
-        options = self.options if options is None else options
-        behind = self.background if background is None else background
-        now = time if isinstance(time, TimeStep) else self.time_step(time)
-        cameras = fixed_cameras(cameras, behind, next(iter(self.field.parameters.values())))
-        views = [
-            self._view(cameras.select(i), now.time or 0.0, options) for i in range(len(cameras))
-        ]
-        rgb, through, depth = (torch.stack(x) for x in zip(*views, strict=True))
-        return composite_background(rgb, through, depth, options, behind)
-
-    def _view(
+    def render_camera(
         self, camera: Cameras, time: float, options: DrawOptions
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return colours on black (H, W, 3), transmittance (H, W) and the sum of weight times z
-        (H, W)."""
         rays, z = camera_rays(camera)
         parts = []
         for begin in range(0, len(rays), CHUNK):

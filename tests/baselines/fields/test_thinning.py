@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from dyngs.models.volume import EVERY, LIGHT, reached_samples, thin_samples
+from dyngs.models.volume import EVERY, LIGHT, visible_samples
 from dyngs.ops.rays import Samples, composite
 
 
@@ -28,7 +28,7 @@ def samples_of(
 def test_visible_samples_are_kept_and_others_subsampled() -> None:
     generator = torch.Generator().manual_seed(0)
     densities, samples = samples_of(40, 40, generator)
-    found, which = thin_samples(
+    found, which = visible_samples(
         densities, samples, torch.rand(40, generator=generator, dtype=torch.float64)
     )
     weights = composite(
@@ -57,9 +57,9 @@ def test_thinned_rays_are_unbiased_with_unbiased_gradients() -> None:
         (grad,) = torch.autograd.grad(drawn.colour.sum() + drawn.transmittance.sum(), leaf)
         return torch.cat([drawn.colour, drawn.transmittance[:, None]], 1).detach(), grad
 
-    full, full_grad = seen(*reached_samples(densities, samples))
+    full, full_grad = seen(*visible_samples(densities, samples))
     parts = [
-        seen(*thin_samples(densities, samples, torch.full((2,), (k + 0.5) / EVERY).double()))
+        seen(*visible_samples(densities, samples, torch.full((2,), (k + 0.5) / EVERY).double()))
         for k in range(4)
     ]
     mean, mean_grad = (sum(x) / EVERY for x in zip(*parts, strict=True))

@@ -32,15 +32,15 @@ from dyngs.human.predict.fields.network import (
     FieldPicture,
     Perceptron,
     PointFeatures,
-    SourceFeatures,
     initialize_network,
     mean_and_variance,
-    relative_directions,
+    mean_over_views,
     sample_maps,
     sample_offsets,
+    view_weights,
 )
 from dyngs.human.predict.keys import EgHumanNerfKeys
-from dyngs.human.predict.people import DILATION, PosedBody
+from dyngs.human.predict.people import DILATION
 from dyngs.models.volume import camera_rays
 from dyngs.ops.rays import Rays
 
@@ -91,9 +91,9 @@ class EgHumanNerf(FieldNetwork):
                 if name in _SMALL_AT_FIRST:
                     weight.mul_(0.1)
 
-    def prepare(self, features: SourceFeatures, body: PosedBody) -> Tensor:
+    def prepare(self, person: EncodedPerson) -> Tensor:
         """Return the depth maps (V, 1, H, W) of the body in the images, m."""
-        depths = [body.depth(camera) for camera in features.sources.cameras]
+        depths = [person.body.depth(camera) for camera in person.sources.cameras]
         return torch.stack(depths)[:, None].clamp(max=_FAR)
 
     def limits(self, person: EncodedPerson, camera: Cameras, z: Tensor) -> tuple[Tensor, Tensor]:
@@ -116,68 +116,66 @@ class EgHumanNerf(FieldNetwork):
         self, person: EncodedPerson, rays: Rays, limits: Tensor, generator: torch.Generator | None
     ) -> tuple[Tensor, Sequence[Any]]:
         """Intermediate results are distances and signed ray distances (R, K) of both stages, m."""
-        features = person.features
         first, last, body = limits.split(1, 1)
 
-        def sample_at(at: Tensor) -> tuple[Tensor, PointFeatures, Tensor]:
+        def look_up(at: Tensor) -> tuple[Tensor, PointFeatures, Tensor]:
             """Return points (R K, 3), their image features, and heights (R, K) above the body."""
             points = rays.origins[:, None] + rays.directions[:, None] * at[..., None]
             points = points.flatten(0, 1)
             height = person.body.height(points).view(at.shape)
-            return points, features.sample(points), height.clamp(-PARAMS.limit, PARAMS.limit)
+            return points, person.sample(points), height.clamp(-PARAMS.limit, PARAMS.limit)
 
-        def hints(seen: PointFeatures, height: Tensor, at: Tensor) -> Tensor:
-            """Return input features (R K, HINTS) of ray samples.
+        def inputs(
+            seen: PointFeatures, height: Tensor, at: Tensor, weights: Tensor | None = None
+        ) -> Tensor:
+            """Return image features and HINTS other features of ray samples (R K, ...).
 
-            They are the distances to the body (signed, absolute, along the ray), the position in
-            the interval, the closest approach of the ray to the body, and alpha of the ray and of
-            the sample.
+            The latter are the distances to the body (signed, absolute, along the ray), the position
+            in the interval, the closest approach of the ray to the body, and alpha of the ray and
+            of the sample.
             """
             along = (body - at).clamp(-DILATION, DILATION) / DILATION
             place = (at - first) / (last - first)
             height = height / PARAMS.limit
             parts = [height, height.abs(), along, place, closest / PARAMS.limit, max_alpha]
-            rows = torch.stack([x.expand_as(at) for x in parts], -1).flatten(0, 1)
-            return torch.cat([rows, seen.coverage], -1)
+            hints = torch.stack([x.expand_as(at) for x in parts], -1).flatten(0, 1)
+            return torch.cat([mean_and_variance(seen.features, weights), hints, seen.coverage], -1)
 
         count = PARAMS.samples
         shifts = sample_offsets(len(rays), count, generator=generator)
         at = first + (last - first) * (torch.arange(count, device="cpu") + shifts).to(first) / count
-        _, seen, height = sample_at(at)
+        _, seen, height = look_up(at)
         closest = height.amin(1, keepdim=True)
         max_alpha = seen.alpha.amin(0).view(at.shape).amax(1, keepdim=True)
-        inputs = [mean_and_variance(seen.features), hints(seen, height, at)]
-        signed = height + PARAMS.limit * self.guide(torch.cat(inputs, -1)).view(at.shape)
+        signed = height + PARAMS.limit * self.guide(inputs(seen, height, at)).view(at.shape)
 
-        surface = expected_surface(at.detach(), signed.detach())[:, None]
+        surface = expected_surface(at.detach(), signed.detach())
         near = surface + at.new_tensor(PARAMS.offsets)
-        points, seen, height = sample_at(near)
-        grid, depth = features.project(points)
-        front = sample_maps(person.extra, grid, "nearest")[..., 0].where(seen.alpha > 0, _FAR)
-        behind = (depth - front) / PARAMS.hidden_by
+        points, seen, height = look_up(near)
+        front = sample_maps(person.extra, seen.grid, "nearest")[..., 0]
+        behind = (seen.depth - front.where(seen.alpha > 0, _FAR)) / PARAMS.hidden_by
         hidden = behind > 1
         # Images in which the sample is hidden, unless it is hidden in all.
         excluded = 1e4 * (hidden & ~hidden.all(0))
         if self.keys.hidden_views == "weighted":
             hidden = behind.clamp(0, 2)
-            excluded = torch.zeros_like(hidden)
+            excluded = 0.0
         directions = rays.directions.repeat_interleave(near.shape[1], 0)
-        relative = relative_directions(directions, points, features.sources.cameras.centers)
+        relative = person.relative_directions(directions, points)
         facts = torch.cat([hidden[..., None].to(relative), relative], -1)
-        logits = self.attention(torch.cat([seen.features, facts], -1))[..., 0]
-        weights = (logits - excluded).softmax(0)
-        inputs = [mean_and_variance(seen.features, weights), hints(seen, height, near)]
-        output = self.surface(torch.cat(inputs, -1))
+        weights = view_weights(self.attention, [seen.features, facts], excluded)
+        output = self.surface(inputs(seen, height, near, weights))
         change = PARAMS.limit * output[:, 0].view(near.shape)
         closer = interpolate_along_rays(at, signed, near) + change
         shared = torch.cat([mean_and_variance(seen.colours, weights), output[:, 1:]], -1)
         shared = shared.expand(len(facts), -1, -1)
-        colours = self.blend_images(seen, [seen.colours, shared, facts], excluded)
+        weights = view_weights(self.blend, [seen.colours, shared, facts], excluded)
+        colours = mean_over_views(seen.rgb, weights).view(*near.shape, 3)
 
         opacity = opacities(near, closer, self.sharpness.exp(), self.keys.density)
         through = pad((1 - opacity).cumprod(1), (1, 0), value=1.0)
         weights = -through.diff(dim=1)
-        colour = (weights[..., None] * colours.view(*near.shape, 3)).sum(1)
+        colour = (weights[..., None] * colours).sum(1)
         distance = (weights * near).sum(1, keepdim=True)
         return torch.cat([colour, through[:, -1:], distance], 1), [(at, signed), (near, closer)]
 
@@ -206,28 +204,32 @@ class EgHumanNerf(FieldNetwork):
 
 
 def expected_surface(at: Tensor, signed: Tensor) -> Tensor:
-    """Return the distances (R,) of the first zero crossing of signed ray distances (R, K) at (R,
+    """Return the distances (R, 1) of the first zero crossing of signed ray distances (R, K) at (R,
     K).
 
-    Without a crossing: the sample with the smallest value.
+    Without a crossing: the sample with the smallest value, or the first one if that is behind.
     """
     crosses = (signed[:, :-1] > 0) & (signed[:, 1:] <= 0)
     index = crosses.to(torch.uint8).argmax(1, keepdim=True)
-    before, after = (signed.gather(1, index + i) for i in (0, 1))
-    low, high = (at.gather(1, index + i) for i in (0, 1))
+    before, after = _neighbours(signed, index)
+    low, high = _neighbours(at, index)
     fraction = before / (before - after).clamp_min(1e-9)
-    smallest = at.gather(1, signed.argmin(1, keepdim=True))
-    smallest = torch.where(signed[:, :1] <= 0, at[:, :1], smallest)
-    return torch.where(crosses.any(1, keepdim=True), low + fraction * (high - low), smallest)[:, 0]
+    smallest = at.gather(1, signed.relu().argmin(1, keepdim=True))
+    return torch.where(crosses.any(1, keepdim=True), low + fraction * (high - low), smallest)
 
 
 def interpolate_along_rays(at: Tensor, values: Tensor, queries: Tensor) -> Tensor:
     """Interpolate values (R, K) at ascending distances (R, K) linearly at ``queries`` (R, N)."""
-    after = torch.searchsorted(at.contiguous(), queries.contiguous()).clamp(1, at.shape[1] - 1)
-    low = at.gather(1, after - 1)
-    high = at.gather(1, after)
+    right = torch.searchsorted(at.contiguous(), queries.contiguous())
+    index = right.clamp(1, at.shape[1] - 1) - 1
+    low, high = _neighbours(at, index)
     fraction = ((queries - low) / (high - low).clamp_min(1e-9)).clamp(0, 1)
-    return torch.lerp(values.gather(1, after - 1), values.gather(1, after), fraction)
+    return torch.lerp(*_neighbours(values, index), fraction)
+
+
+def _neighbours(values: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
+    """Return values (R, K) at ``index`` (R, N) and behind it."""
+    return values.gather(1, index), values.gather(1, index + 1)
 
 
 def opacities(at: Tensor, signed: Tensor, sharpness: Tensor, form: str = "neus") -> Tensor:
@@ -238,8 +240,7 @@ def opacities(at: Tensor, signed: Tensor, sharpness: Tensor, form: str = "neus")
     alpha Psi(-s) with the Laplace distribution function Psi of scale beta (Yariv et al. 2021;
     alpha = 1 / beta = ``sharpness``, per m).
     """
-    gaps = at.diff(dim=1)
-    gaps = torch.cat([gaps[:, :1], gaps, gaps[:, -1:]], 1)
+    gaps = pad(at.diff(dim=1), (1, 1), mode="replicate")
     half = (gaps[:, :-1] + gaps[:, 1:]) / 4
     if form == "laplace":
         tail = (-sharpness * signed.abs()).exp() / 2

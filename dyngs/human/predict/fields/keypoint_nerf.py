@@ -30,13 +30,14 @@ from dyngs.human.predict.fields.network import (
     SourceFeatures,
     initialize_network,
     mean_and_variance,
-    relative_directions,
+    mean_over_views,
     sample_maps,
     sample_offsets,
+    view_weights,
 )
 from dyngs.human.predict.keys import EgHumanNerfKeys
-from dyngs.human.predict.people import NUM_KEY_POINTS, PosedBody, Sources
-from dyngs.models.volume import reached_samples, select_samples, thin_samples
+from dyngs.human.predict.people import NUM_KEY_POINTS, Sources
+from dyngs.models.volume import select_samples, visible_samples
 from dyngs.ops.rays import MarchSteps, Rays, Space, composite, march
 
 
@@ -76,50 +77,43 @@ class KeypointNerf(FieldNetwork):
         self.blend = Perceptron(3 * colours + 4, width, width // 2, 1)
         initialize_network(self, generator)
 
-    def prepare(self, features: SourceFeatures, body: PosedBody) -> tuple[Space, Tensor]:
-        return visual_hull(features, body.key_points)
+    def prepare(self, person: EncodedPerson) -> tuple[Space, Tensor]:
+        return visual_hull(person, person.body.key_points)
 
     def march(
         self, person: EncodedPerson, rays: Rays, limits: Tensor, generator: torch.Generator | None
     ) -> tuple[Tensor, Sequence[Any]]:
-        features = person.features
         space, occupied = person.extra
         shifts = sample_offsets(len(rays), generator=generator).to(rays.origins)
         samples = march(rays, shifts, space, occupied, MarchSteps(NEAR, PARAMS.step))
         is_training = torch.is_grad_enabled()
         with torch.no_grad():  # densities alone decide which samples are rendered
-            alpha = features.alpha(to_world(samples.coords, space)) > PARAMS.visible
+            alpha = person.alpha(to_world(samples.coords, space)) > PARAMS.visible
             samples = select_samples(samples, alpha.all(0))[0]
             points = to_world(samples.coords, space)
-            code = spatial_code(points, person.body.key_points, features.sources)
-            seen = features.sample(points)
-            geometry = self._geometry(person, points, code, seen)
-            if is_training:
-                samples, which = thin_samples(density(geometry), samples, shifts)
-            else:
-                samples, which = reached_samples(density(geometry), samples)
+            geometry = self._geometry(person, points, person.sample(points))
+            samples, which = visible_samples(
+                density(geometry), samples, shifts if is_training else None
+            )
             points = points[which]
-        seen = features.sample(points)
-        geometry = (
-            self._geometry(person, points, code[:, which], seen) if is_training else geometry[which]
-        )
-        count = len(features.sources)
+        seen = person.sample(points)
+        geometry = self._geometry(person, points, seen) if is_training else geometry[which]
+        count = len(person.sources)
         per_view = torch.cat([seen.colours, geometry[:, 1:].expand(count, -1, -1)], -1)
         pooled = mean_and_variance(per_view).expand(count, -1, -1)
         directions = rays.directions[samples.rays.long()]
-        directions = relative_directions(directions, points, features.sources.cameras.centers)
-        colours = self.blend_images(seen, [per_view, pooled, directions])
-        image = composite(density(geometry), colours, samples)
+        relative = person.relative_directions(directions, points)
+        weights = view_weights(self.blend, [per_view, pooled, relative])
+        image = composite(density(geometry), mean_over_views(seen.rgb, weights), samples)
         return torch.cat([image.colour, image.transmittance[:, None], image.depth[:, None]], 1), []
 
-    def _geometry(
-        self, person: EncodedPerson, points: Tensor, code: Tensor, seen: PointFeatures
-    ) -> Tensor:
+    def _geometry(self, person: EncodedPerson, points: Tensor, seen: PointFeatures) -> Tensor:
         """Return raw density and geometry features (M, 1 + PARAMS.geometry) of points (M, 3).
 
         The initial density is that of limbs of constant thickness.
         """
         bone = distance_to_bones(points, person.body.key_points)[:, None]
+        code = spatial_code(points, person.body.key_points, person.sources)
         per_image = self.per_image(torch.cat([code, seen.features], -1))
         distance = bone / PARAMS.reach
         hints = torch.cat([distance, distance.square(), seen.coverage], -1)
@@ -164,8 +158,8 @@ def visual_hull(features: SourceFeatures, key_points: Tensor) -> tuple[Space, Te
     x, y, z = ((low + high) / 2).tolist()
     space = Space((x, y, z), half, 1, PARAMS.cells)
     axis = (torch.arange(PARAMS.cells, device=low.device) + 0.5) / PARAMS.cells
-    z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
-    middles = to_world(torch.stack([x, y, z], -1).view(-1, 3), space)
+    # The first axis of the grid is z.
+    middles = to_world(torch.cartesian_prod(axis, axis, axis).flip(1), space)
     grid, depth = features.project(middles)
     sources = features.sources
     reach = half / PARAMS.cells * math.sqrt(3)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, ClassVar
 
@@ -16,7 +16,6 @@ from torch import Tensor, nn
 from torch.nn.functional import grid_sample, normalize
 
 from dyngs.core.camera import Cameras
-from dyngs.core.initialisation import glorot
 from dyngs.data.loader import Image
 from dyngs.human.predict.keys import EgHumanNerfKeys
 from dyngs.human.predict.people import PosedBody, Sources
@@ -40,8 +39,7 @@ class Perceptron(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         layers = [Layer(layer.weight, layer.bias) for layer in self.layers]  # pyright: ignore[reportArgumentType]
-        rows = perceptron(x.flatten(0, -2), layers)
-        return rows.view(*x.shape[:-1], rows.shape[-1])
+        return perceptron(x.flatten(0, -2), layers).unflatten(0, x.shape[:-1])
 
 
 class ImageEncoder(nn.Module):
@@ -68,6 +66,8 @@ class PointFeatures:
     features: Tensor  # (V, M, C + FINE)
     rgb: Tensor  # (V, M, 3) straight colours
     alpha: Tensor  # (V, M), 0 outside the image
+    grid: Tensor  # (V, M, 2) and depth (V, M), see ``SourceFeatures.project``
+    depth: Tensor
 
     @property
     def colours(self) -> Tensor:
@@ -90,7 +90,7 @@ class SourceFeatures:
 
     def sample(self, points: Tensor) -> PointFeatures:
         """Sample images and features at points (M, 3); differentiable in the features."""
-        grid, _ = self.project(points)
+        grid, depth = self.project(points)
         rgba = sample_maps(self.sources.rgba, grid)
         # Convolutions with stride s centre feature i on pixel s i: half of s - 1 px before the
         # middle of the pixels that a map of 1/s of the resolution is sampled as.
@@ -103,6 +103,8 @@ class SourceFeatures:
             torch.cat(features, -1),
             rgba[..., :3] / rgba[..., 3:].clamp_min(_MIN_ALPHA),
             rgba[..., 3],
+            grid,
+            depth,
         )
 
     def alpha(self, points: Tensor) -> Tensor:
@@ -120,6 +122,16 @@ class SourceFeatures:
         grid = 2 * pixels / pixels.new_tensor(sources.rgba.shape[:1:-1]) - 1
         return torch.where(depth[..., None] > _MIN_DEPTH, grid, 2.0).clamp(-2, 2), depth
 
+    def relative_directions(self, directions: Tensor, points: Tensor) -> Tensor:
+        """Return ray directions relative to those of the images (V, M, 4).
+
+        The normalised difference and the dot product of ray directions (M, 3) and directions from
+        the cameras to ``points`` (M, 3).
+        """
+        from_images = normalize(points - self.sources.cameras.centers[:, None], dim=-1)
+        difference = normalize(directions - from_images, dim=-1)
+        return torch.cat([difference, (directions * from_images).sum(-1, keepdim=True)], -1)
+
 
 def sample_maps(maps: Tensor, grid: Tensor, mode: str = "bilinear") -> Tensor:
     """Sample maps (V, D, h, w) at positions (V, M, 2) in [-1, 1]; return (V, M, D), 0 outside."""
@@ -128,35 +140,34 @@ def sample_maps(maps: Tensor, grid: Tensor, mode: str = "bilinear") -> Tensor:
 
 
 def initialize_network(network: nn.Module, generator: torch.Generator) -> None:
-    """Initialise all weights from ``generator`` on the CPU; biases are 0."""
+    """Initialise all weights from ``generator`` on the CPU (linear layers: Glorot and Bengio 2010);
+    biases are 0."""
     initialize_weights(network, generator)
     for layer in network.modules():
         if isinstance(layer, nn.Linear):
-            with torch.no_grad():
-                layer.weight.copy_(glorot(layer.in_features, layer.out_features, generator))
-                layer.bias.zero_()
+            nn.init.xavier_uniform_(layer.weight, generator=generator)
+            nn.init.zeros_(layer.bias)
+
+
+def mean_over_views(values: Tensor, weights: Tensor | None = None) -> Tensor:
+    """Return the mean (M, D) over views of values (V, M, D), with weights (V, M) that sum to 1."""
+    return values.mean(0) if weights is None else (weights[..., None] * values).sum(0)
 
 
 def mean_and_variance(values: Tensor, weights: Tensor | None = None) -> Tensor:
-    """Return mean and variance (M, 2 D) over views of values (V, M, D), with weights (V, M) that
-    sum to 1."""
-
-    def mean(x: Tensor) -> Tensor:
-        return x.mean(0) if weights is None else (weights[..., None] * x).sum(0)
-
-    middle = mean(values)
-    return torch.cat([middle, mean((values - middle).square())], -1)
+    """Return mean and variance (M, 2 D) over views, see ``mean_over_views``."""
+    mean = mean_over_views(values, weights)
+    return torch.cat([mean, mean_over_views((values - mean).square(), weights)], -1)
 
 
-def relative_directions(directions: Tensor, points: Tensor, centers: Tensor) -> Tensor:
-    """Return ray directions relative to those of the source cameras (V, M, 4).
+def view_weights(
+    network: Perceptron, inputs: list[Tensor], excluded: Tensor | float = 0.0
+) -> Tensor:
+    """Return weights (V, M) of the views that sum to 1.
 
-    The normalised difference and the dot product of ray directions (M, 3) and directions from
-    camera ``centers`` (V, 3) to ``points`` (M, 3).
+    ``network`` predicts their logits from ``inputs`` (V, M, D); ``excluded`` (V, M) is subtracted.
     """
-    source_directions = normalize(points - centers[:, None], dim=-1)
-    difference = normalize(directions - source_directions, dim=-1)
-    return torch.cat([difference, (directions * source_directions).sum(-1, keepdim=True)], -1)
+    return (network(torch.cat(inputs, -1))[..., 0] - excluded).softmax(0)
 
 
 def sample_offsets(*shape: int, generator: torch.Generator | None) -> Tensor:
@@ -181,19 +192,17 @@ class FieldPicture:
 
 
 @dataclass(frozen=True)
-class EncodedPerson:
+class EncodedPerson(SourceFeatures):
     """Person encoded by a network: image features, body, and data of the network's own."""
 
-    features: SourceFeatures
     body: PosedBody
-    extra: Any  # see ``FieldNetwork.prepare``
+    extra: Any = None  # see ``FieldNetwork.prepare``
 
 
 class FieldNetwork(nn.Module, ABC):
     """Network that predicts a radiance field of a person from images and a posed body."""
 
     needs_depth: ClassVar[bool] = False  # whether training needs depth maps
-    blend: Perceptron  # logits of the images' colours
 
     def __init__(self, features: int, keys: EgHumanNerfKeys) -> None:
         super().__init__()
@@ -202,11 +211,11 @@ class FieldNetwork(nn.Module, ABC):
 
     def encode(self, sources: Sources, body: PosedBody) -> EncodedPerson:
         """Encode a person from images and a body; differentiable."""
-        features = SourceFeatures(sources, *self.encoder(sources.rgba))
-        return EncodedPerson(features, body, self.prepare(features, body))
+        person = EncodedPerson(sources, *self.encoder(sources.rgba), body)
+        return replace(person, extra=self.prepare(person))
 
     @abstractmethod
-    def prepare(self, features: SourceFeatures, body: PosedBody) -> Any:
+    def prepare(self, person: EncodedPerson) -> Any:
         """Return ``EncodedPerson.extra``."""
 
     def limits(self, person: EncodedPerson, camera: Cameras, z: Tensor) -> tuple[Tensor, Tensor]:
@@ -244,17 +253,6 @@ class FieldNetwork(nn.Module, ABC):
         canvas = canvas.view(camera.height, count, camera.width, count, 5).mean((1, 3))
         samples = [(rows, *pair) for pair in found[0][1]] if torch.is_grad_enabled() else []
         return FieldPicture(canvas[..., :3], canvas[..., 3], canvas[..., 4], samples)
-
-    def blend_images(
-        self, seen: PointFeatures, inputs: list[Tensor], excluded: Tensor | float = 0.0
-    ) -> Tensor:
-        """Return the colours (M, 3) of points, blended from the images.
-
-        ``inputs`` (V, M, D) give the logits of the weights, from which ``excluded`` (V, M) is
-        subtracted.
-        """
-        weights = (self.blend(torch.cat(inputs, -1))[..., 0] - excluded).softmax(0)
-        return (weights[..., None] * seen.rgb).sum(0)
 
     def penalty(self, picture: FieldPicture, image: Image, scale: float) -> Tensor:
         """Return loss terms besides the image error; ``scale``: depth map units per metre."""

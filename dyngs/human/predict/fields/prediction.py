@@ -19,11 +19,9 @@ from dyngs.core.errors import DyngsError
 from dyngs.core.state import Role, State, add_prefix, move_fields_to, with_role
 from dyngs.core.tensor_checks import require_indices, require_positive, require_tensor
 from dyngs.data.loader import Image
-from dyngs.data.read import list_captures
-from dyngs.data.times import distinct_times
-from dyngs.human.body.body import BodyTemplate
-from dyngs.human.body.body_reader import default_template, read_body
+from dyngs.human.body.body_reader import load_template
 from dyngs.human.fit.fitted_capture import ensure_fitted_body
+from dyngs.human.keys import HumanModel
 from dyngs.human.predict.fields.eg_human_nerf import EgHumanNerf
 from dyngs.human.predict.fields.keypoint_nerf import AROUND, KeypointNerf
 from dyngs.human.predict.fields.network import EncodedPerson, FieldNetwork
@@ -36,7 +34,7 @@ from dyngs.human.predict.gps.rectification import (
     training_pairs,
     views_by_time,
 )
-from dyngs.human.predict.keys import FieldPredictorModel, PredictedFieldModel
+from dyngs.human.predict.keys import PredictedFieldModel
 from dyngs.human.predict.people import (
     MULTIPLE,
     Person,
@@ -51,24 +49,20 @@ from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import StartContext
 from dyngs.models.model import Model, RenderOutput, UpdateResult
 from dyngs.models.prediction import (
+    CaptureLearner,
     Example,
-    Learner,
     Predictor,
     image_loss,
-    keep_captures_open,
     load_weights,
     random_index,
+    random_item,
 )
 from dyngs.models.renderable import (
     DrawOptions,
+    RayScene,
     Renderable,
-    Rendering,
-    TimeStep,
-    composite_background,
-    fixed_cameras,
 )
 from dyngs.models.views import evaluation_background
-from dyngs.ops.device import CPU, select_device
 
 NETWORKS: dict[str, Callable[..., FieldNetwork]] = {
     "keypoint_nerf": KeypointNerf,
@@ -78,7 +72,7 @@ NETWORKS: dict[str, Callable[..., FieldNetwork]] = {
 
 
 @dataclass(frozen=True, repr=False)
-class PredictedField(Renderable):
+class PredictedField(RayScene):
     """Radiance field of a person, predicted from ``sources``; static."""
 
     network: FieldNetwork
@@ -98,8 +92,8 @@ class PredictedField(Renderable):
         return self.scale * torch.stack([points.amin(0) - AROUND, points.amax(0) + AROUND])
 
     @property
-    def device(self) -> torch.device:
-        return self.sources.rgba.device
+    def example(self) -> Tensor:
+        return self.sources.rgba
 
     @cached_property
     def encoded(self) -> EncodedPerson:
@@ -115,26 +109,12 @@ class PredictedField(Renderable):
         tensors["numbers"] = torch.tensor([self.scale], dtype=torch.float64, device="cpu")
         return add_prefix("field", with_role(tensors, Role.SHARED))
 
-    def render(
-        self,
-        cameras: Cameras,
-        time: float | TimeStep | None = None,
-        *,
-        options: Any = None,
-        background: Tensor | None = None,
-    ) -> Rendering:
-        options = self.options if options is None else options
-        background_colour = self.background if background is None else background
-        cameras = fixed_cameras(cameras, background_colour, self.sources.rgba)
+    def render_camera(
+        self, camera: Cameras, time: float, options: Any
+    ) -> tuple[Tensor, Tensor, Tensor]:
         with torch.no_grad():
-            renders = [
-                self.network.render(self.encoded, cameras_in_metres(cameras.select(i), self.scale))
-                for i in range(len(cameras))
-            ]
-        rgb = torch.stack([x.colour for x in renders])
-        transmittance = torch.stack([x.transmittance for x in renders])
-        depth = self.scale * torch.stack([x.depth for x in renders])
-        return composite_background(rgb, transmittance, depth, options, background_colour)
+            found = self.network.render(self.encoded, cameras_in_metres(camera, self.scale))
+        return found.colour, found.transmittance, self.scale * found.depth
 
 
 def restore(model: PredictedFieldModel, checkpoint: Checkpoint) -> PredictedField:
@@ -227,8 +207,7 @@ class FieldPredictor(Predictor[FieldNetwork]):
         return PredictedField(self.network, sources, body, scale, background=self.background)
 
     def run_config(self, views: Sequence[int]) -> Config:
-        times = distinct_times(self.views).values()
-        data = self.data_at_time(self.views[views[0]].time, times)
+        data = self.data_at_time(self.views[views[0]].time, self.views)
         keys = self.section.model_dump(include=set(PredictedFieldModel.model_fields) - {"kind"})
         model = PredictedFieldModel.model_validate({"network": self.section.kind} | keys)
         return self.config.model_copy(update={"data": data, "model": model})
@@ -237,22 +216,11 @@ class FieldPredictor(Predictor[FieldNetwork]):
         model.scene = scene
 
 
-class FieldLearner(Learner[FieldNetwork]):
+class FieldLearner(CaptureLearner[FieldNetwork, Person]):
     """Trains on patches of images, predicted from other images of the same time step."""
 
-    def __init__(
-        self,
-        config: Config,
-        network: FieldNetwork,
-        people: Sequence[DataConfig],
-        device: torch.device = CPU,
-    ) -> None:
-        super().__init__(config, network, [person.root.name for person in people], device)
-        self._template = template_of(self.section)
-        self._opened = keep_captures_open(self._open, people)
-
     def example(self, person: int, step: int, generator: torch.Generator) -> Example:
-        captured = self._opened(person)
+        captured = self.opened(person)
         sources, target = self._views(captured, generator)
         body, scale = captured.body_in(captured.views[target], self.device)
         sources_in = move_fields_to(
@@ -277,11 +245,10 @@ class FieldLearner(Learner[FieldNetwork]):
         """Choose source views of one time step, every other time evenly around the person, and a
         target view; or a pair and a view between."""
         if self.section.training_views == "between":
-            pairs = training_pairs(person.views)
-            pair, between = pairs[random_index(len(pairs), generator)]
-            return list(pair), between[random_index(len(between), generator)]
+            pair, between = random_item(training_pairs(person.views), generator)
+            return list(pair), random_item(between, generator)
         rings = [ring for ring in views_by_time(person.views).values() if len(ring) > FEWEST_VIEWS]
-        ring = rings[random_index(len(rings), generator)]
+        ring = random_item(rings, generator)
         max_count = min(self.section.source_views, len(ring) - 1)
         count = FEWEST_VIEWS + random_index(max_count - FEWEST_VIEWS + 1, generator)
         if random_index(2, generator):
@@ -290,11 +257,11 @@ class FieldLearner(Learner[FieldNetwork]):
             order = torch.randperm(len(ring), generator=generator, device="cpu")[:count]
             sources = [ring[i] for i in order.tolist()]
         others = [i for i in ring if i not in sources]
-        return sources, others[random_index(len(others), generator)]
+        return sources, random_item(others, generator)
 
-    def _open(self, data: DataConfig) -> Person:
+    def open_person(self, data: DataConfig) -> Person:
         """Return a person to train on. Raises DyngsError: too few views, or no depth maps."""
-        captured = read_captured_person(data, self._template)
+        captured = read_captured_person(data, load_template(HumanModel(body=self.section.body)))
         if self.section.training_views == "between" and not training_pairs(captured.views):
             raise DyngsError(
                 f"{data.root}: no view lies between two others at most {MAX_ANGLE:g} degrees "
@@ -314,15 +281,13 @@ def _random_patch(image: Image, side: int, generator: torch.Generator) -> Image:
     """Return a patch around a random pixel of the person."""
     assert image.alpha is not None
     where = (image.alpha > _MIN_ALPHA).nonzero()
-    row, column = where[random_index(len(where), generator)].tolist() if len(where) else (0, 0)
+    row, column = random_item(where.tolist() or [[0, 0]], generator)
     return crop_window(image, column - side // 2, row - side // 2, side)
 
 
 def learner(config: Config, generator: torch.Generator) -> FieldLearner:
     """Return the network in training, before the first step."""
-    device = select_device(config.run.device)
-    network = NETWORKS[config.model.kind](generator, config.model).to(device)
-    return FieldLearner(config, network, list_captures(config.data), device)
+    return FieldLearner(config, NETWORKS[config.model.kind](generator, config.model))
 
 
 def predictor(
@@ -342,8 +307,5 @@ def predictor(
     load_weights(network, checkpoint)
     if model.body is None:
         data = ensure_fitted_body(data, only_if_needed=True, log=log, on_progress=on_progress)
-    return FieldPredictor(config, network, read_captured_person(data, template_of(model)), data)
-
-
-def template_of(model: FieldPredictorModel) -> BodyTemplate:
-    return default_template() if model.body is None else read_body(model.body)
+    person = read_captured_person(data, load_template(HumanModel(body=model.body)))
+    return FieldPredictor(config, network, person, data)

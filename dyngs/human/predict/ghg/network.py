@@ -58,6 +58,7 @@ from dyngs.models.prediction import (
     load_weights,
     optimizer_step,
     random_index,
+    random_item,
     upsample,
 )
 from dyngs.models.renderable import Renderable
@@ -640,7 +641,7 @@ class AtlasLearner(Learner[AtlasNetwork]):
         """Return images of one time step that are not among the sources, if possible."""
         views = person.views
         others = [i for i in range(len(views)) if i not in inputs] or inputs
-        frame = views[others[random_index(len(others), generator)]].frame
+        frame = views[random_item(others, generator)].frame
         same_frame = [i for i in others if views[i].frame == frame]
         order = torch.randperm(len(same_frame), generator=generator, device="cpu").tolist()
         return [person.images[same_frame[i]].to(self.device) for i in order[:TARGET_VIEWS]]

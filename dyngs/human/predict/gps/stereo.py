@@ -25,8 +25,7 @@ from dyngs.core.errors import DyngsError
 from dyngs.core.state import move_fields_to
 from dyngs.data.capture import Capture, all_views
 from dyngs.data.loader import Image, ImageLoader
-from dyngs.data.read import list_captures, read_capture
-from dyngs.data.times import distinct_times
+from dyngs.data.read import read_capture
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.filters import FilterUpdate
 from dyngs.gaussians.scene import render_options
@@ -46,20 +45,18 @@ from dyngs.human.predict.gps.rectification import (
 )
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.prediction import (
+    CaptureLearner,
     Encoder,
     Example,
-    Learner,
     Predictor,
     ResidualBlock,
     image_loss,
     initialize_weights,
-    keep_captures_open,
     load_weights,
-    random_index,
+    random_item,
     upsample,
 )
 from dyngs.models.renderable import Renderable
-from dyngs.ops.device import CPU, select_device
 from dyngs.ops.quaternions import quat_product, quats_from_matrices, unit_quats
 
 WIDTHS = (24, 40, 64)
@@ -199,6 +196,8 @@ _INSIDE = 0.999  # share of the person at a match without background, up to roun
 DEPTH_WEIGHT = 0.02  # of the offset error, px, next to the image loss
 _AROUND = 8  # background around the person in target images, px
 _MIN_OPACITY = 0.02  # of predicted Gaussians
+# Images of a person with depth maps, and training pairs, see ``training_pairs``.
+_Opened = tuple[ImageLoader, list[tuple[tuple[int, int], list[int]]]]
 
 
 class GpsPredictor(Predictor[GpsNetwork]):
@@ -252,31 +251,35 @@ class GpsPredictor(Predictor[GpsNetwork]):
             update={name: getattr(self.config.model, name) for name in shared_keys}
         )
         filmed = all_views({k: x for k, x in self._capture.splits.items() if k != "pose"})
-        times = distinct_times(filmed).values()
-        data = self.data_at_time(self.views[views[0]].time, times)
+        data = self.data_at_time(self.views[views[0]].time, filmed)
         return preset.model_copy(update={"data": data, "model": model})
 
     def begin(self, model: Any, scene: Renderable, config: Config) -> None:
         model.start_from(scene, StaticTraining(FilterUpdate()))
 
 
-class GpsLearner(Learner[GpsNetwork]):
+class GpsLearner(CaptureLearner[GpsNetwork, _Opened]):
     """Trains on depth maps first, then also on images of views between those of a pair."""
 
-    def __init__(
-        self,
-        config: Config,
-        network: GpsNetwork,
-        people: Sequence[DataConfig],
-        device: torch.device = CPU,
-    ) -> None:
-        super().__init__(config, network, [person.root.name for person in people], device)
-        self._opened = keep_captures_open(_open_person, people)
+    def open_person(self, data: DataConfig) -> _Opened:
+        views = _with_silhouettes(data).splits["train"]
+        pairs = training_pairs(views)
+        if not pairs:
+            raise DyngsError(
+                f"{data.root}: no view lies between two others at most {MAX_ANGLE:g} degrees "
+                "apart, as training needs; use a ring of 16 or more cameras"
+            )
+        if any(view.depth_path is None for view in views):
+            raise DyngsError(
+                f"{data.root}: no depth maps, which training needs; `dyngs data synth people` "
+                "writes them"
+            )
+        return ImageLoader(views, data, with_maps=True), pairs
 
     def example(self, person: int, step: int, generator: torch.Generator) -> Example:
-        images, pairs = self._opened(person)
-        pair, between = pairs[random_index(len(pairs), generator)]
-        target = between[random_index(len(between), generator)]
+        images, pairs = self.opened(person)
+        pair, between = random_item(pairs, generator)
+        target = random_item(between, generator)
         background = self.sample_background(generator)
         left, right = (images[i] for i in pair)
         rectified = rectify_views(left, right, self.section.person_px)
@@ -309,23 +312,6 @@ class GpsLearner(Learner[GpsNetwork]):
         return offset_loss(pair, offsets, decay) + consistency
 
 
-def _open_person(data: DataConfig) -> tuple[ImageLoader, list[tuple[tuple[int, int], list[int]]]]:
-    """Return the images of a person with depth maps, and its training pairs."""
-    views = _with_silhouettes(data).splits["train"]
-    pairs = training_pairs(views)
-    if not pairs:
-        raise DyngsError(
-            f"{data.root}: no view lies between two others at most {MAX_ANGLE:g} degrees apart, "
-            "as training needs; use a ring of 16 or more cameras"
-        )
-    if any(view.depth_path is None for view in views):
-        raise DyngsError(
-            f"{data.root}: no depth maps, which training needs; `dyngs data synth people` writes "
-            "them"
-        )
-    return ImageLoader(views, data, with_maps=True), pairs
-
-
 def _with_silhouettes(data: DataConfig) -> Capture:
     capture = read_capture(data)
     if not capture.has_alpha:
@@ -343,9 +329,7 @@ def _offset_image(pair: RectifiedPair, offsets: Tensor) -> Tensor:
 
 def learner(config: Config, generator: torch.Generator) -> GpsLearner:
     """Return the network in training, before the first step."""
-    device = select_device(config.run.device)
-    network = GpsNetwork(generator, config.model).to(device)
-    return GpsLearner(config, network, list_captures(config.data), device)
+    return GpsLearner(config, GpsNetwork(generator, config.model))
 
 
 def predictor(

@@ -137,6 +137,23 @@ def test_heights_grow_steadily_through_the_surface() -> None:
     torch.testing.assert_close(far, torch.full((2,), 0.08))
 
 
+def test_heights_of_cells_are_distances_to_the_nearest_vertex() -> None:
+    """In float64, of all vertices, inside and outside; at most 8 cm."""
+    ball = body(RADIUS)
+    grid, low, size = ball._heights
+    counts = torch.tensor(grid.shape[2:])
+    generator = torch.Generator().manual_seed(0)
+    cells = (torch.rand(2000, 3, generator=generator) * counts).long()
+    centres = low.double() + (cells + 0.5) * size.double() / counts
+    distance, nearest = torch.cdist(centres, ball.vertices.double()).min(1)
+    is_inside = ((centres - ball.vertices[nearest]) * ball.vertices[nearest]).sum(1) < 0
+    expected = torch.where(is_inside, -distance, distance)
+    expected = torch.where(distance < 0.08, expected, 0.08).float()
+    torch.testing.assert_close(grid[0, 0][cells.unbind(1)], expected, atol=1e-6, rtol=0)
+    assert float((expected < 0).float().mean()) > 0.05
+    assert float((expected == 0.08).float().mean()) > 0.3
+
+
 def test_the_surface_of_a_dressed_person_lies_in_between(person: Person) -> None:
     own, scale = person.body_in(person.views[0])
     image = person.images[0]

@@ -49,7 +49,7 @@ def test_the_surface_is_where_the_distance_first_crosses_zero() -> None:
         ]
     )
     found = expected_surface(at, signed)
-    torch.testing.assert_close(found, torch.tensor([2.5, 2.25, 2.0, 3.5, 1 + 2 / 3]))
+    torch.testing.assert_close(found[:, 0], torch.tensor([2.5, 2.25, 2.0, 3.5, 1 + 2 / 3]))
 
 
 def test_a_surface_hides_what_is_behind_it_and_nothing_else_is_opaque() -> None:
@@ -106,12 +106,11 @@ def test_hidden_views_are_excluded_or_weighted(person: Person, mode: str) -> Non
     pictures = []
     with torch.no_grad():
         for colour in (0.0, 1.0):
-            rgba = own.features.sources.rgba.clone()
+            rgba = own.sources.rgba.clone()
             rgba[1, :3] = colour * rgba[1, 3:]
-            sources = replace(own.features.sources, rgba=rgba)
-            features = replace(own.features, sources=sources)
+            sources = replace(own.sources, rgba=rgba)
             pictures.append(
-                network.render(replace(own, features=features, extra=hidden), camera).colour
+                network.render(replace(own, sources=sources, extra=hidden), camera).colour
             )
     alpha = person.images[1].alpha
     assert alpha is not None

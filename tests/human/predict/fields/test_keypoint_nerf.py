@@ -75,7 +75,7 @@ def test_occupied_cells_cover_only_the_body(network: KeypointNerf, person: Perso
         space, occupied = own.extra
         cells = (space.unit(own.body.vertices) * space.cells).long()
         x, y, z = cells.unbind(1)
-        shown = (own.features.alpha(own.body.vertices) > 0.5).all(0)
+        shown = (own.alpha(own.body.vertices) > 0.5).all(0)
         assert float(shown.float().mean()) > 0.5, "at 40 px many vertices lie on the outline"
         assert bool(occupied[0, z, y, x][shown].all())
         assert 0.001 < float(occupied.float().mean()) < 0.15
