@@ -210,7 +210,7 @@ def expected_surface(at: Tensor, signed: Tensor) -> Tensor:
     Without a crossing: the sample with the smallest value, or the first one if that is behind.
     """
     crosses = (signed[:, :-1] > 0) & (signed[:, 1:] <= 0)
-    index = crosses.to(torch.uint8).argmax(1, keepdim=True)
+    index = crosses.int().argmax(1, keepdim=True)
     before, after = _neighbours(signed, index)
     low, high = _neighbours(at, index)
     fraction = before / (before - after).clamp_min(1e-9)
@@ -220,8 +220,7 @@ def expected_surface(at: Tensor, signed: Tensor) -> Tensor:
 
 def interpolate_along_rays(at: Tensor, values: Tensor, queries: Tensor) -> Tensor:
     """Interpolate values (R, K) at ascending distances (R, K) linearly at ``queries`` (R, N)."""
-    right = torch.searchsorted(at.contiguous(), queries.contiguous())
-    index = right.clamp(1, at.shape[1] - 1) - 1
+    index = torch.searchsorted(at, queries).clamp(1, at.shape[1] - 1) - 1
     low, high = _neighbours(at, index)
     fraction = ((queries - low) / (high - low).clamp_min(1e-9)).clamp(0, 1)
     return torch.lerp(*_neighbours(values, index), fraction)
@@ -240,7 +239,8 @@ def opacities(at: Tensor, signed: Tensor, sharpness: Tensor, form: str = "neus")
     alpha Psi(-s) with the Laplace distribution function Psi of scale beta (Yariv et al. 2021;
     alpha = 1 / beta = ``sharpness``, per m).
     """
-    gaps = pad(at.diff(dim=1), (1, 1), mode="replicate")
+    gaps = at.diff(dim=1)
+    gaps = torch.cat([gaps[:, :1], gaps, gaps[:, -1:]], 1)
     half = (gaps[:, :-1] + gaps[:, 1:]) / 4
     if form == "laplace":
         tail = (-sharpness * signed.abs()).exp() / 2

@@ -98,7 +98,7 @@ class KeypointNerf(FieldNetwork):
             points = points[which]
         seen = person.sample(points)
         geometry = self._geometry(person, points, seen) if is_training else geometry[which]
-        count = len(person.sources)
+        count = len(seen.rgb)
         per_view = torch.cat([seen.colours, geometry[:, 1:].expand(count, -1, -1)], -1)
         pooled = mean_and_variance(per_view).expand(count, -1, -1)
         directions = rays.directions[samples.rays.long()]

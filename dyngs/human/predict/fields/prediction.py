@@ -102,7 +102,7 @@ class PredictedField(RayScene):
             return self.network.encode(self.sources, self.body)
 
     def state(self) -> State:
-        tensors = {f"network.{name}": x.detach() for name, x in self.network.state_dict().items()}
+        tensors = {f"network.{name}": x for name, x in self.network.state_dict().items()}
         tensors |= {f"sources.{name}": x for name, x in vars(self.sources).items()}
         body = vars(dataclasses.replace(self.body))  # without what it keeps
         tensors |= {f"body.{name}": x for name, x in body.items()}

@@ -49,7 +49,7 @@ def test_sources_are_the_images_around_the_person(person: Person) -> None:
     body, scale = person.body_in(person.views[0])
     sources = crop_source_images(images, scale)
     height, width = sources.rgba.shape[2:]
-    assert (height % 8, width % 8, len(sources)) == (0, 0, 3)
+    assert (height % 8, width % 8, len(sources.rgba)) == (0, 0, 3)
     for i, image in enumerate(images):
         assert image.alpha is not None
         assert float(sources.rgba[i, 3].sum()) == pytest.approx(float(image.alpha.sum()))
