@@ -211,7 +211,8 @@ class FieldNetwork(nn.Module, ABC):
 
     def encode(self, sources: Sources, body: PosedBody) -> EncodedPerson:
         """Encode a person from images and a body; differentiable."""
-        person = EncodedPerson(sources, *self.encoder(sources.rgba), body)
+        coarse, fine = self.encoder(sources.rgba)
+        person = EncodedPerson(sources, coarse, fine, body)
         return replace(person, extra=self.prepare(person))
 
     @abstractmethod
