@@ -348,7 +348,7 @@ class TriangleScene(Renderable):
         limits = ProjectionOptions(near=options.near)
         projection = project(means, quats, scales, opacities, camera, limits)
         boundaries = None
-        if options.boundary_weights:
+        if options.boundary_weights and self.patches.log_scales is None:
             samples = projection.means2d[0]
             boundaries = Boundaries(places.rows[0], places.ids, samples, BOUNDARY_RADIUS)
         channels = _with_depths(colours, projection.depths[0], options)[None]

@@ -54,21 +54,29 @@ def doubled(patches: Patches) -> Patches:
 
 @pytest.mark.parametrize("options", [PLAIN, WEIGHTED])
 def test_images_and_gradients_equal_reference(options: TriangleOptions) -> None:
-    """Each step in plain torch in float64, from the patches that pixels show."""
+    """Each step in plain torch in float64, from the patches that pixels show; before textures with
+    weights, then without."""
     patches = doubled(bent(6, seed=2, degree=0))
+    if options.boundary_weights:
+        patches = replace(patches, log_scales=None, quats=None)
     view = camera(20).to(dtype=torch.float64)
-    found, places = TriangleScene(patches, 1.0, options).render_view(view, options)
+    scene = TriangleScene(patches, 1.0, options, scale=0.08)
+    found, places = scene.render_view(view, options)
     assert len(places.ids) > 80
 
     def textured(values: Tensor) -> Tensor:
         return patch_values(values, places.ids, places.uv, SHAPE_SEGMENTS)
 
     means = reference_values(patches.points, places.ids, places.uv)
-    scales = textured(patches.tensors["log_scales"]).exp()
+    scales = torch.full_like(means, scene.scale)
+    quats = torch.eye(4, dtype=torch.float64)[:1].expand(len(means), 4)
+    if not options.boundary_weights:
+        scales = textured(patches.tensors["log_scales"]).exp()
+        quats = textured(patches.tensors["quats"])
     opacities = torch.full((len(means),), OPACITY, dtype=torch.float64)
     splats = reference.project(
         means,
-        textured(patches.tensors["quats"]),
+        quats,
         scales,
         opacities,
         view,
@@ -122,6 +130,14 @@ def test_weights_sharpen_outlines() -> None:
     assert weighted.alpha[0, 16, 4] == 0
     assert alone.alpha[0, 16, 4] > 0.01
     assert weighted.alpha[0, 16, 5] < alone.alpha[0, 16, 5]
+
+
+def test_weights_end_where_textures_of_scales_begin() -> None:
+    scene = square()
+    textured = replace(scene, patches=scene.patches.with_shapes(scene.scale))
+    weighted, alone = (textured.render(camera(), options=x) for x in (WEIGHTED, PLAIN))
+    assert torch.equal(weighted.rgb, alone.rgb)
+    assert not torch.equal(scene.render(camera()).rgb, alone.rgb)
 
 
 def test_silhouettes_follow_their_gradient() -> None:

@@ -5,7 +5,12 @@ from __future__ import annotations
 import torch
 from small_triangles import camera, triangle
 
-from dyngs.baselines.triangles.training import TriangleStatistics, near_outline
+from dyngs.baselines.triangles.training import (
+    MIN_EDGE,
+    TriangleStatistics,
+    image_gradients,
+    near_outline,
+)
 from dyngs.ops.patches import PatchSamples, visible_patches
 
 BEHIND = triangle((-1, -1, -9), (1, -1, -9), (0, 1, -9))
@@ -36,3 +41,16 @@ def test_outlines_are_where_ids_change() -> None:
     assert not found[:4, :4].any()
     assert found.any()
     assert len(near_outline(places_of(BEHIND))) == 0
+
+
+def test_image_gradients_are_those_of_prewitt() -> None:
+    image = torch.rand(9, 13, 3, generator=torch.Generator().manual_seed(0))
+    across = torch.tensor([[-1.0, 0, 1]] * 3) / 3
+    kernels = torch.stack([across, across.T])[:, None]
+    inner = torch.nn.functional.conv2d(image.permute(2, 0, 1)[:, None], kernels)
+    sizes = inner.square().sum(1).sqrt()
+    sizes[sizes < MIN_EDGE] = 0
+    found = image_gradients(image)
+    torch.testing.assert_close(found[1:-1, 1:-1], sizes.mean(0))
+    assert found.shape == image.shape[:2]
+    assert image_gradients(0.1 * image).abs().max() == 0
