@@ -57,12 +57,12 @@ class BgTriangleModel(ModelSection):
         gt=0,
         le=100,
         description="with model.primitives=gaussians, standard deviation of Gaussians before "
-        "textures, pixels at the centre of the scene; about 2 as published",
+        "textures, pixels at the centre of the scene; as published about 2 at 800 px, 1 at 400 px",
     )
     boundary_weights: bool = Field(
         default=True,
         description="with model.primitives=gaussians, fade a triangle's Gaussians within two "
-        "pixels of its outline",
+        "pixels of its outline until textures are trained",
     )
 
 

@@ -197,7 +197,9 @@ class TriangleOptions(DrawOptions):
     segments: int = SEGMENTS  # per edge: a triangle is rendered as ``segments``^2 flat faces
     supersampling: int = 1  # a pixel is the mean of this squared number of samples
     primitives: Literal["faces", "gaussians"] = "faces"
-    boundary_weights: bool = True  # of Gaussians near the outlines of their triangles
+    # Of Gaussians near the outlines of their triangles, while these have no textures of scales.
+    # Later Gaussians are too narrow: half weights from both sides of a seam leave it transparent.
+    boundary_weights: bool = True
 
 
 @dataclass(frozen=True, repr=False)
