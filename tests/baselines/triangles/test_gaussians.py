@@ -152,6 +152,34 @@ def test_silhouettes_follow_their_gradient() -> None:
     assert (outwards.sum((1, 2)) < 0).all()
 
 
+@pytest.mark.parametrize(("options", "least"), [(PLAIN, 0.9), (WEIGHTED, 0.7)])
+def test_gradients_along_a_path_add_up_to_the_change_of_the_loss(
+    options: TriangleOptions, least: float
+) -> None:
+    """Over three pixels: samples keep their places on patches in the gradient only, and samples of
+    the outline lie at pixel centres, so that single gradients differ from those of the image."""
+    scene = square()
+    points = scene.patches.points.double()
+    pixel = 4 / (32 * 1.2)
+    step = torch.tensor([pixel, 0, 0], dtype=torch.float64)
+
+    def drawn(moved: Tensor) -> Tensor:
+        patches = Patches(points + moved * step, scene.patches.colours.double(), points[:, :0])
+        at = replace(scene, patches=patches, scale=pixel)
+        return at.render(camera().to(dtype=torch.float64), options=options).rgb
+
+    target = drawn(torch.tensor(4.0))
+    losses: list[Tensor] = []
+    slopes: list[Tensor] = []
+    for moved in torch.linspace(-1.5, 1.5, 31, dtype=torch.float64):
+        leaf = moved.clone().requires_grad_()
+        losses.append((drawn(leaf) - target).square().sum())
+        slopes.extend(torch.autograd.grad(losses[-1], leaf))
+    total = torch.trapezoid(torch.stack(slopes), dx=0.1)
+    ratio = float(total / (losses[-1] - losses[0]).detach())
+    assert least < ratio < 1.05
+
+
 def test_an_empty_view_is_black() -> None:
     scene = square()
     behind = replace(scene.patches, points=scene.patches.points - torch.tensor([0, 0, 9.0]))
