@@ -516,7 +516,7 @@ VIEW_CHOICES_PER_PERSON = 6  # source view sets per person in training; their ma
 TARGET_VIEWS = 2  # target images per training step, of one time step
 SQUARED_WEIGHT = 1.0  # of the mean squared error in the loss, which emphasises edges
 MEAN_COLOUR_VIEWS = 8  # images per person for the mean colours
-ADAPTATION_STEPS = 40  # training steps on the input images before a prediction
+ADAPTATION_STEPS = 10  # training steps on the input images before a prediction
 ADAPTATION_RATE = 1e-4
 """Initial learning rate of Adam per input image, falling linearly; more images allow more."""
 _MIN_OPACITY = 0.02  # of predicted Gaussians, as in the preset ``human``

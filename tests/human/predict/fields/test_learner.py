@@ -50,17 +50,16 @@ def test_a_resumed_run_ends_with_the_same_bytes(run: Path, folder: Path, tmp_pat
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_training_lowers_the_error(folder: Path, tmp_path: Path, kind: str) -> None:
-    """On the same examples of both people: about 0.7 of it is left."""
-    trainer = network_trainer(field_config(kind, folder, tmp_path / "run", steps=60))
+    """On the same examples: 0.77 and 0.70 of it are left."""
+    trainer = network_trainer(field_config(kind, folder, tmp_path / "run", steps=40))
 
     @torch.no_grad()
     def error() -> float:
-        draws = [torch.Generator().manual_seed(i) for i in range(6)]
-        examples = [trainer.learner.example(i % 2, 1, draw) for i, draw in enumerate(draws)]
-        return sum(float(example.loss) for example in examples)
+        draws = (torch.Generator().manual_seed(i) for i in range(6))
+        return sum(float(trainer.learner.example(0, 1, draw).loss) for draw in draws)
 
     before = error()
-    for _ in range(50):
+    for _ in range(30):
         trainer.step()
     assert error() < 0.9 * before
 
