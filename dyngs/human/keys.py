@@ -92,5 +92,5 @@ class HumanPredictorModel(_OnTemplate):
         "nearby and the mirrored side, inpainted: by gated convolutions on the UV map (GHG)",
     )
     lr: Positive = Field(
-        default=2e-3, description="peak learning rate of AdamW (one-cycle schedule)"
+        default=1e-3, description="peak learning rate of AdamW (one-cycle schedule)"
     )

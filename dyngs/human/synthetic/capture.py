@@ -792,7 +792,7 @@ class PeopleOptions:
     cameras: int = 24  # on a ring around each person
     frames: int = 1  # per person
     seed: int = 0  # different seeds share no body, outfit, motion, light or camera ring
-    body_error: float = 0.4  # see ``HumanOptions``; bodies of captures are estimates, too
+    body_error: float = 0.15  # see ``HumanOptions``; bodies of captures are estimates, too
 
 
 def write_people(
