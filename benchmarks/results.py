@@ -107,9 +107,6 @@ MEASUREMENTS = {
         "systems", "lego", "lego400", "ngp", ("data.longest_side=200",)
     ),
     "lego400_nerf": Measurement("systems", "lego", "lego400", "nerf"),
-    "lego400_bg_triangle": Measurement(
-        "systems", "lego", "lego400", "bg_triangle", ("data.longest_side=200",)
-    ),
     "orbits_4dgs": Measurement("systems", "orbits", "orbits", "4dgs"),
     "orbits_deformable_3dgs": Measurement("systems", "orbits", "orbits", "deformable_3dgs"),
     "orbits_gaussians_4d": Measurement("systems", "orbits", "orbits", "gaussians_4d"),
