@@ -65,7 +65,7 @@ def fit_minutes(
 
 
 def _measured(trainer: Trainer[Any], seconds: float) -> TimeForecast:
-    """Time a few steps of ``trainer``, for at most ``seconds``, and return a forecast."""
+    """Time steps of ``trainer`` for about ``seconds``, at least one, and return a forecast."""
     begun = time.perf_counter()
     last = min(WARM_UP + 20, trainer.config.train.steps)
     forecast = _forecast(trainer, begun)
@@ -78,7 +78,8 @@ def _measured(trainer: Trainer[Any], seconds: float) -> TimeForecast:
             forecast = _forecast(trainer, now)
         else:
             forecast.observe(trainer.config, trainer.done, now, trainer.num_gaussians)
-        if now - begun > seconds and trainer.done != WARM_UP:
+        # the first step may begin with one-time work, such as a surface to start from
+        if now - begun > seconds and trainer.done > WARM_UP:
             break
     return forecast
 
