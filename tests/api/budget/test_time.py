@@ -117,7 +117,7 @@ def test_images_are_halved_until_enough_steps_fit(
 def test_one_time_work_of_the_first_step_halves_no_images(
     still: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    slow(monkeypatch, 0.5, before=1)
+    slow(monkeypatch, 1.2, before=1)
     monkeypatch.setattr("dyngs.api.budget.time.SMALLEST_SIDE", 4)
-    run = train(config_of(still, tmp_path / "run", 0.08))
+    run = train(config_of(still, tmp_path / "run", 0.3, "train.steps=250"))
     assert load_resolved(run).data.longest_side not in (4, 8)  # images have 16 px
