@@ -181,9 +181,12 @@ def store(name: str, run: Path, cpu_seconds: float, threads: int, commit: str, d
     """Write the JSON of a measurement from a finished run and its metrics.json."""
     measurement = MEASUREMENTS[name]
     metrics = json.loads((run / "metrics.json").read_text(encoding="utf-8"))
-    export = run.parent / f"{run.name}_export"
-    if not export.exists():
-        run_dyngs(["export", str(run), "--format", "dyngs", "--out", str(export)])
+    stored_mb = None
+    if measurement.page in DETAILS:  # the page of systems shows no sizes, and fields have no file
+        export = run.parent / f"{run.name}_export"
+        if not export.exists():
+            run_dyngs(["export", str(run), "--format", "dyngs", "--out", str(export)])
+        stored_mb = (export / "scene.dyngs").stat().st_size / 1e6
     keys = {field.name for field in fields(Result)} & metrics.keys()
     values = {key: metrics[key] for key in keys if metrics[key] is not None}
     place = Path(measurement.capture).name
@@ -197,7 +200,7 @@ def store(name: str, run: Path, cpu_seconds: float, threads: int, commit: str, d
         "threads": threads,
         "steps": metrics["step"],
         "image_size": f"{metrics['width']}x{metrics['height']}",
-        "stored_mb": (export / "scene.dyngs").stat().st_size / 1e6,
+        "stored_mb": stored_mb,
         "cpu_seconds": cpu_seconds,
         "wall_seconds": metrics["seconds_train"],
     }
