@@ -484,7 +484,8 @@ COMPARISONS = {
     ),
     "triangles": (
         "Triangles and Gaussians",
-        "Equal minutes and numbers of learned values, one thread (`benchmarks/triangles.py`).",
+        "At most six minutes, or the steps of the preset, with about as many learned numbers; one\n"
+        "thread (`benchmarks/triangles.py`).",
     ),
 }
 HIDDEN = ("commit", "command")

@@ -78,7 +78,7 @@ def _measured(trainer: Trainer[Any], seconds: float) -> TimeForecast:
             forecast = _forecast(trainer, now)
         else:
             forecast.observe(trainer.config, trainer.done, now, trainer.num_gaussians)
-        # the first step may begin with one-time work, such as a surface to start from
+        # The first step may include one-time work, such as the initial surface of bg_triangle.
         if now - begun > seconds and trainer.done > WARM_UP:
             break
     return forecast
