@@ -24,7 +24,8 @@ MOTION = 2.0  # Factor by which a step costs more once the scene may move
 # Exponent with which the number of Gaussians grows with the side of the images (measured: 2 to 4.7
 # times more from a quarter to the full size).
 DETAIL = 0.5
-ONE_TIME = 20.0  # Factor over the mean step from which a step contains a one-time computation
+# Factor over the usual time of steps from which they contain a one-time computation
+ONE_TIME = 20.0
 SAMPLES = 64  # Steps at which the cost of a range of steps is sampled
 SAVE_FRACTION = 0.05  # Largest fraction of the training time that regular checkpoints may take
 
@@ -116,10 +117,13 @@ class TimeForecast:
         self._marks = [replace(mark, seconds=mark.seconds + seconds) for mark in self._marks]
 
     def observe(self, config: Config, step: int, seconds: float, num_gaussians: int) -> None:
-        """Record a finished step. One-time computations (start of motion) do not count."""
-        duration = seconds - self._marks[-1].seconds
-        if len(self._marks) > 1 and duration > ONE_TIME * self.mean_step:
-            self.exclude(duration - self.mean_step)
+        """Record the steps since the last call, up to ``step``. One-time computations (start of
+        motion) do not count."""
+        last = self._marks[-1]
+        usual = (step - last.step) * self.mean_step
+        one_time = (seconds - last.seconds) - usual
+        if len(self._marks) > 1 and one_time > ONE_TIME * usual:
+            self.exclude(one_time)
         last = self._marks[-1]
         cost = (step - last.step) * step_cost(config, step, self.pixels, num_gaussians)
         self._marks.append(_Mark(step, seconds, last.cost + cost, num_gaussians))

@@ -47,6 +47,18 @@ def test_one_time_computations_do_not_count() -> None:
     assert one.seconds(CONFIG, 100) == pytest.approx(other.seconds(CONFIG, 100))
 
 
+def test_slower_steps_count_when_ten_are_observed_at_a_time() -> None:
+    """A machine that becomes three times as slow is no one-time computation."""
+    config = CONFIG.replace({"train.steps": 10_000, "train.initial_downscale": 1})
+    forecast = TimeForecast(0, 0.0, 0, PIXELS)
+    seconds = 0.0
+    for step in range(10, 210, 10):
+        seconds += 10.0 if step <= 50 else 30.0
+        forecast.observe(config, step, seconds, 0)
+    per_step = forecast.seconds(config, 10_000, 9_900) / 100
+    assert per_step == pytest.approx(3.0, rel=0.3)
+
+
 def test_checkpoints_are_due_by_time_and_less_often_where_they_are_slow() -> None:
     timer = SaveTimer(1.0, 0.0)
     assert not timer.is_due(59)
