@@ -204,6 +204,8 @@ def load_resolved(
         data["follow_links"] = run_links_allowed()
         # Runs of versions without this key were trained on full images.
         data.setdefault("longest_side", None)
+        # and held out the first image.
+        data.setdefault("test_first", 0)
         if isinstance(data.get("body"), str):
             data["body"] = str(file.parent.absolute() / data["body"])
     layers.add_overrides(overrides)

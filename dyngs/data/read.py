@@ -180,9 +180,10 @@ def read_capture(source: DataConfig | Path | str, decode_videos: bool = True) ->
 
     Views are sorted by name. ``frames`` of the options selects among the times of all splits,
     ``pose_frames`` the times of the split pose. If the format defines no test views, every
-    ``test_every``-th image is one. Times are scaled to [0, 1] over all splits. Poses, points and
-    bodies are in scene coordinates, see ``scene_space.normalise_capture``. Splits train, val and
-    test always exist; val and test may be empty.
+    ``test_every``-th image is one, from ``test_first`` on. Times are scaled to [0, 1] over all
+    splits. Poses, points and bodies are in scene coordinates, see
+    ``scene_space.normalise_capture``. Splits train, val and test always exist; val and test may be
+    empty.
 
     Example:
 
@@ -396,9 +397,9 @@ def _with_splits(capture: Capture, options: DataConfig) -> tuple[Capture, list[s
         seconds = span[1] - span[0]
     if "test" not in splits:
         views = splits["train"]
-        every = options.test_every
-        splits["test"] = views[::every] if every else ()
-        splits["train"] = tuple(view for i, view in enumerate(views) if not every or i % every)
+        held_out = _held_out(views, options)
+        splits["test"] = tuple(view for view in views if view.name in held_out)
+        splits["train"] = tuple(view for view in views if view.name not in held_out)
     if not splits["train"]:
         raise DyngsError(
             f"{capture.root}: no training views remain; change data.frames, data.pose_frames or "
@@ -408,6 +409,21 @@ def _with_splits(capture: Capture, options: DataConfig) -> tuple[Capture, list[s
     if new_poses is not None:
         splits["pose"] = new_poses
     return replace(capture, splits=splits, file_time_span=span, seconds=seconds), notes
+
+
+def _held_out(views: tuple[View, ...], options: DataConfig) -> set[str]:
+    """Return the names of the views that ``test_every`` holds out."""
+    every = options.test_every
+    if not every:
+        return set()
+    first = options.test_first
+    if first is None and views[0].time is not None:
+        # The ends of a clip are trained on, because nothing can be extrapolated.
+        clip = sorted(views, key=lambda view: (view.camera_id, view.time or 0.0, view.name))
+        inner = clip[every // 2 : -1 : every]
+        if inner:
+            return {view.name for view in inner}
+    return {view.name for view in views[first or 0 :: every]}
 
 
 def _with_poses_held_out(

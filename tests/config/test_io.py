@@ -117,6 +117,7 @@ def test_stored_configurations_with_former_keys_and_values_still_load(tmp_path: 
     assert config.model.pilot_runs
     assert config.train.robust == "never"
     assert config.init.trainable == "colour"
+    assert (config.data.longest_side, config.data.test_first) == (None, 0), "as they were trained"
 
 
 # --------------------------------------------------------------------------------------- overrides

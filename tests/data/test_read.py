@@ -147,8 +147,24 @@ def test_frames_of_any_format_with_times(blender_root: Path) -> None:
     }
     (blender_root / "transforms_test.json").unlink()
     capture = read(blender_root, frames="::2", test_every=4)
-    assert names(capture, "test") == ["train/r_0", "train/r_2"]
+    assert names(capture, "test") == ["train/r_12", "train/r_4"]
     assert len(names(capture, "train")) == 6
+
+
+def test_the_ends_of_a_clip_are_trained_on(blender_root: Path) -> None:
+    """In order of time, whatever the order of names; images without times start at the first."""
+    (blender_root / "transforms_test.json").unlink()
+    assert held_out_frames(read(blender_root, test_every=4)) == [0, 12, 2, 6]
+    set_times(blender_root, "train", [float(15 - i) for i in range(16)])
+    capture = read(blender_root, test_every=4)
+    assert held_out_frames(capture) == [1, 13, 5, 9]
+    assert {0.0, 1.0} < {view.time for view in capture.splits["train"]}
+    assert held_out_frames(read(blender_root, test_every=4, test_first=3)) == [11, 15, 5, 9]
+    assert held_out_frames(read(blender_root, test_every=15)) == [8]
+
+
+def held_out_frames(capture: Capture) -> list[int]:
+    return [int(name.removeprefix("train/r_")) for name in names(capture, "test")]
 
 
 @pytest.mark.parametrize("form", ["nerfies", "llff", "camera_folders"])

@@ -588,7 +588,8 @@ def _digest(data: DataConfig) -> str:
         paths = [path for path in root.rglob("*") if path.is_file()]
         files = sorted(path for path in paths if path.stat().st_size < 100_000_000)
     names = (
-        "format frames pose_frames train_cameras times frames_per_second test_every skip_missing"
+        "format frames pose_frames train_cameras times frames_per_second test_every test_first "
+        "skip_missing"
     )
     options = data.model_dump(mode="json", include=set(names.split()))
     options_hash = hashlib.sha256(repr(sorted(options.items())).encode()).hexdigest()[:8]

@@ -197,8 +197,8 @@ def test_the_last_frames_are_held_out_as_new_poses(root: Path) -> None:
     assert [
         [view.frame for view in capture.splits[name]] for name in ("train", "test", "pose")
     ] == [
-        [1, 3],
-        [0, 2],
+        [0, 2, 3],
+        [1],
         [4, 5],
     ]
     assert [view.time for view in capture.splits["pose"]] == [0, 1]
