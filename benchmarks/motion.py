@@ -51,6 +51,7 @@ from dyngs.data.times import evenly_spaced
 from dyngs.deform.field import DeformationField, FieldSetup, Offsets, select_rows
 from dyngs.deform.random_gaussians import box_of
 from dyngs.deform.scene import DynamicScene
+from dyngs.evaluate.motion_masks import MotionMasks
 from dyngs.evaluate.report import evaluate_run, split_views
 from dyngs.evaluate.view_scores import Regions, score_views
 from dyngs.gaussians import TopologyEdit
@@ -285,7 +286,7 @@ def measured(scene: GaussianScene, config: Config) -> Row:
     views = split_views(capture, "test")
     background = scene.background if scene.background is not None else torch.zeros(3, device="cpu")
     loader = ImageLoader(views, config.data)
-    regions = Regions(views, loader, background)
+    regions = Regions(views, MotionMasks(capture, config.data))
     images = (loader[i] for i in range(len(loader)))
     scores, _ = score_views(
         scene, images, scene.options, background, Lpips("alex", "not measured"), regions

@@ -20,6 +20,7 @@ from dyngs.core.metrics import Lpips, LpipsNet, load_lpips, psnr
 from dyngs.data.capture import Capture, View
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.times import evenly_spaced
+from dyngs.evaluate.motion_masks import MotionMasks
 from dyngs.evaluate.view_scores import (
     FLIP_PIXELS,
     POSE_METRICS,
@@ -261,7 +262,7 @@ def evaluate_run(
         torch.set_num_threads(threads)
     loader = load_split_images(capture, views, run_dir, run)
     loader.device = render_device
-    regions = Regions(views, loader, drawing.background)
+    regions = Regions(views, MotionMasks(capture, run.config.data))
 
     def images() -> Iterator[Image]:
         for index in range(len(loader)):

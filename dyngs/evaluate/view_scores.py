@@ -26,8 +26,8 @@ from dyngs.core.errors import DyngsError
 from dyngs.core.metrics import Lpips, flip, psnr, ssim
 from dyngs.data.capture import View
 from dyngs.data.images.maps import silhouette_box
-from dyngs.data.loader import Image, ImageLoader
-from dyngs.data.times import evenly_spaced, static_cameras
+from dyngs.data.loader import Image
+from dyngs.evaluate.motion_masks import MotionMasks, erode
 from dyngs.gaussians.colour.network import apply_affine_colour, fit_affine_colour
 from dyngs.human.avatar.scene import as_human_scene
 from dyngs.models.renderable import DrawOptions, Renderable, Rendering
@@ -37,9 +37,6 @@ from dyngs.ops.device import synchronize
 REGION_METRICS = ("psnr_foreground", "psnr_moving", "psnr_static")
 
 FEWEST_PIXELS = 25  # Regions with fewer pixels in a view are not scored
-# Mean channel difference from the camera's median image, in [0, 1], above which a pixel moves
-CHANGE = 0.05
-MEDIAN_IMAGES = 31  # Images, spread over the clip, of which a camera's median is computed
 
 # Pixels on which FLIP is computed per split: it takes several times as long as rendering on a GPU
 FLIP_PIXELS = 20e6
@@ -48,32 +45,25 @@ SOLID = 0.9
 
 NO_ALPHA = "the images have no alpha"
 NO_TIMES = "the images have no times"
-NO_MOTION_KNOWN = "no motion masks, and no static camera with several time steps in this split"
+NO_MOTION_KNOWN = "no motion masks, and too few times to estimate them"
 TOO_SMALL = f"fewer than {FEWEST_PIXELS} pixels in each view"
 
 
 class Regions:
     """Foreground, moving and static regions of the images of one split.
 
-    The foreground is where the true alpha is positive. The moving region is taken from motion
-    masks. Without masks, views of static cameras use pixels that differ by ``CHANGE`` from their
-    median over time. The static region is the remainder. With a foreground, both are restricted to
-    it.
+    The foreground is where the true alpha is positive. The moving region is taken from the motion
+    masks of the capture, else estimated, see ``motion_masks``. The static region is the remainder.
+    With a foreground, both are restricted to it.
 
     Args:
-        loader: images of ``views``.
-        background: (3,) colour behind them.
+        views: views of the split.
+        masks: estimates the moving region. None: unknown without motion masks of the capture.
     """
 
-    def __init__(self, views: Sequence[View], loader: ImageLoader, background: Tensor) -> None:
-        self._loader, self._background = loader, background
-        self._cameras = {
-            views[i].name: indices
-            for indices in static_cameras(views)
-            if len(indices) >= 3
-            for i in indices
-        }
-        self._medians: dict[tuple[int, ...], Tensor] = {}
+    def __init__(self, views: Sequence[View], masks: MotionMasks | None = None) -> None:
+        self._views = {view.name: view for view in views}
+        self._masks = masks
         self._has_times = any(view.time is not None for view in views)
         self._moving_from: set[str] = set()
         self._has_alpha = False
@@ -95,12 +85,14 @@ class Regions:
         if image.motion_mask is not None:
             self._moving_from.add("motion masks")
             return image.motion_mask >= 0.5
-        indices = self._cameras.get(image.name)
-        if indices is None:
+        if self._masks is None:
             return None
-        self._moving_from.add("change over time")
-        change = (image.composite(self._background) - self._median(indices)).abs().mean(-1)
-        return _morphological_opening(change > CHANGE)
+        height, width = image.rgb_premultiplied.shape[:2]
+        mask = self._masks.mask(self._views[image.name], width, height)
+        if mask is not None:
+            self._moving_from.add("change over time")
+            mask = mask.to(image.rgb_premultiplied.device)
+        return mask
 
     @property
     def moving_from(self) -> str | None:
@@ -115,18 +107,6 @@ class Regions:
             return TOO_SMALL
         return NO_MOTION_KNOWN if self._has_times else NO_TIMES
 
-    def _median(self, indices: Sequence[int]) -> Tensor:
-        """Return the median image (H, W, 3) over time of a static camera."""
-        key = tuple(indices)
-        if key not in self._medians:
-            chosen = [indices[i] for i in evenly_spaced(len(indices), MEDIAN_IMAGES)]
-            shown = [
-                (255 * self._loader[i].composite(self._background).clamp(0, 1)).round().byte()
-                for i in chosen
-            ]
-            self._medians[key] = torch.stack(shown).median(dim=0).values
-        return self._medians[key].float() / 255
-
 
 def _psnr_inside(
     part: Tensor | None, image: Image, rendered: Tensor, truth: Tensor
@@ -135,19 +115,6 @@ def _psnr_inside(
         return None
     weights = part.float() if image.mask is None else part * image.mask
     return psnr(rendered, truth, weights) if int((weights > 0).sum()) >= FEWEST_PIXELS else None
-
-
-def _morphological_opening(shown: Tensor) -> Tensor:
-    """Return the opening (H, W) bool of ``shown`` by 3 x 3 pixels."""
-    kept = _erode(shown, radius=1)[None, None].float()
-    return torch.nn.functional.max_pool2d(kept, 3, stride=1, padding=1)[0, 0] > 0.5
-
-
-def _erode(shown: Tensor, radius: int) -> Tensor:
-    """Return the pixels (H, W) bool whose neighbours within ``radius`` are all ``shown``."""
-    hidden = (~shown)[None, None].float()
-    width = 2 * radius + 1
-    return torch.nn.functional.max_pool2d(hidden, width, stride=1, padding=radius)[0, 0] == 0
 
 
 @dataclass(frozen=True)
@@ -330,7 +297,7 @@ def background_scores(image: Image, rendering: Rendering, background: Tensor) ->
         scores[f"psnr_{name}"] = psnr(shown, image.composite(colour), image.mask)
     if image.alpha is not None:
         # Silhouettes are slightly off in every scene: edges are no sign of wrong opacities.
-        interior = _erode(image.alpha >= 0.999, radius=2)
+        interior = erode(image.alpha >= 0.999, radius=2)
         holes = interior & (rendering.alpha[0] < SOLID)
         scores["see_through"] = int(holes.sum()) / max(int(interior.sum()), 1)
     return scores

@@ -119,7 +119,9 @@ def _is_alive(pid: int) -> bool:
     return True
 
 
-def cache_folder(kind: Literal["frames", "poses", "bodies", "people", "captures"]) -> Path:
+def cache_folder(
+    kind: Literal["frames", "poses", "bodies", "people", "captures", "motion"],
+) -> Path:
     """Return the folder of one kind of cached files: in ``$DYNGS_CACHE_DIR``, else in the user's
     cache."""
     chosen = os.environ.get(CACHE_VARIABLE, "")

@@ -15,6 +15,7 @@ from dyngs.core.errors import format_count, log_info
 from dyngs.core.metrics import load_lpips
 from dyngs.data.loader import ImageLoader
 from dyngs.data.times import evenly_spaced
+from dyngs.evaluate.motion_masks import MotionMasks
 from dyngs.evaluate.report import load_split_images
 from dyngs.evaluate.view_scores import Regions, SceneRenderer, score_views, time_renders
 from dyngs.io.write import write_image
@@ -119,7 +120,7 @@ class SceneMeasurer:
         return measurement
 
     def _measurement(self, study_scene: StudyScene, folder: Path) -> Measurement:
-        drawing, loader = self._open_renderer(study_scene.run_dir, folder)
+        drawing, loader, masks = self._open_renderer(study_scene.run_dir, folder)
         background = drawing.background
         scores, _ = score_views(
             drawing.scene,
@@ -127,7 +128,7 @@ class SceneMeasurer:
             drawing.options,
             background,
             load_lpips("alex", background.device),
-            Regions(loader.views, loader, background),
+            Regions(loader.views, masks),
             flip_every=0,
         )
         means: dict[str, Any] = {}
@@ -161,9 +162,11 @@ class SceneMeasurer:
             psnr_worst=min(score.psnr for score in scores),
         )
 
-    def _open_renderer(self, run_dir: Path, folder: Path) -> tuple[SceneRenderer, ImageLoader]:
-        """Return the renderer of the scene in ``folder``, and the images of the run in
-        ``run_dir``."""
+    def _open_renderer(
+        self, run_dir: Path, folder: Path
+    ) -> tuple[SceneRenderer, ImageLoader, MotionMasks]:
+        """Return the renderer of the scene in ``folder``, and the images and motion masks of the
+        run in ``run_dir``."""
         run = load_run(run_dir)
         device = select_device(self.device)
         capture = read_run_capture(run.config.data, run.info)
@@ -172,7 +175,8 @@ class SceneMeasurer:
         loader.device = device
         _, background = evaluation_background(run.config.data.background, capture.has_alpha)
         scene = scene_of_split(load_run(folder), capture, self.split).to(device)
-        return SceneRenderer(scene, scene.options, background.to(device)), loader
+        masks = MotionMasks(capture, run.config.data)
+        return SceneRenderer(scene, scene.options, background.to(device)), loader, masks
 
     def with_speeds(self, study_scenes: Sequence[StudyScene]) -> list[Measurement]:
         """Return the measurements of all scenes, with missing speeds measured now.
@@ -194,7 +198,7 @@ class SceneMeasurer:
             loader = drawn[0][1]
             images = [loader[i] for i in evenly_spaced(len(loader), self.timed_views)]
             with kernel_threads(self.threads or num_cores()):
-                seconds = time_renders([drawing for drawing, _ in drawn], images, self.rounds)
+                seconds = time_renders([drawing for drawing, *_ in drawn], images, self.rounds)
             for i, own in zip(together, seconds, strict=True):
                 if found[i].ms is None:
                     gain = median((seconds[0] / own).tolist())
