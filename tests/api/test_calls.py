@@ -42,9 +42,9 @@ def test_captures_in_memory_hold_the_same_pixels_cameras_times_and_masks() -> No
     images, cameras = twelve_images()
     masks = [np.arange(80).reshape(8, 10) % 3 > 0] * 12
     capture = dyngs.Capture.from_images(images / 255, list(cameras), times=range(12), masks=masks)
-    assert [view.name[-2:] for view in capture.splits["test"]] == ["00", "08"]
+    assert [view.name[-2:] for view in capture.splits["test"]] == ["04"]
     loader = ImageLoader(capture.splits["train"])
-    for i, number in enumerate([1, 2, 3, 4, 5, 6, 7, 9, 10, 11]):
+    for i, number in enumerate([0, 1, 2, 3, 5, 6, 7, 8, 9, 10, 11]):
         image = loader[i]
         assert torch.equal(
             (255 * image.rgb_premultiplied).round().byte(), torch.tensor(images[number])
