@@ -176,10 +176,11 @@ def _rows_of_regions(report: EvalReport) -> list[tuple[str, str]]:
     rows = []
     if report.psnr_foreground is not None:
         rows.append(("on the foreground", f"{report.psnr_foreground:.2f} dB"))
-    for label, value in (
-        ("on what moves", report.psnr_moving),
-        ("on what does not", report.psnr_static),
-    ):
-        if value is not None:
-            rows.append((label, f"{value:.2f} dB (by {report.moving_from})"))
+    if report.psnr_moving is not None:
+        ssim = "" if report.ssim_moving is None else f", SSIM {report.ssim_moving:.4f}"
+        flip = "" if report.flip_moving is None else f", FLIP {report.flip_moving:.4f}"
+        source = f" (by {report.moving_from})"
+        rows.append(("on what moves", f"{report.psnr_moving:.2f} dB{ssim}{flip}{source}"))
+    if report.psnr_static is not None:
+        rows.append(("on what does not", f"{report.psnr_static:.2f} dB"))
     return rows

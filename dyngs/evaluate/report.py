@@ -179,6 +179,8 @@ class EvalReport:
     psnr_foreground: float | None = None
     psnr_moving: float | None = None
     psnr_static: float | None = None
+    ssim_moving: float | None = None
+    flip_moving: float | None = None
     moving_from: str | None = None  # source of the moving region, None if unknown
     psnr_right: float | None = None
     psnr_right_fitted: float | None = None

@@ -34,7 +34,13 @@ from dyngs.models.renderable import DrawOptions, Renderable, Rendering
 from dyngs.models.views import background_colour
 from dyngs.ops.device import synchronize
 
-REGION_METRICS = ("psnr_foreground", "psnr_moving", "psnr_static")
+REGION_METRICS = (
+    "psnr_foreground",
+    "psnr_moving",
+    "psnr_static",
+    "ssim_moving",
+    "flip_moving",
+)
 
 FEWEST_PIXELS = 25  # Regions with fewer pixels in a view are not scored
 
@@ -68,17 +74,26 @@ class Regions:
         self._moving_from: set[str] = set()
         self._has_alpha = False
 
-    def scores(self, image: Image, rendered: Tensor, truth: Tensor) -> dict[str, float | None]:
-        """Return the PSNR of the regions of a view in dB, by metric. None for unknown or small
-        regions."""
+    def scores(
+        self, image: Image, rendered: Tensor, truth: Tensor, with_flip: bool = False
+    ) -> dict[str, float | None]:
+        """Return the scores of the regions of a view, by metric; PSNR in dB. None for unknown or
+        small regions."""
         moves = self.moving(image)
         foreground = None if image.alpha is None else image.alpha > 0
         self._has_alpha |= foreground is not None
-        parts: list[Tensor | None] = [foreground, None, None]
-        if moves is not None:
-            parts[1:] = [x if foreground is None else x & foreground for x in (moves, ~moves)]
-        found = [_psnr_inside(part, image, rendered, truth) for part in parts]
-        return dict(zip(REGION_METRICS, found, strict=True))
+        parts = {"psnr_foreground": foreground, "psnr_moving": moves}
+        parts["psnr_static"] = None if moves is None else ~moves
+        scores: dict[str, float | None] = dict.fromkeys(REGION_METRICS)
+        for metric, part in parts.items():
+            weights = _weights(part, foreground, image.mask)
+            if weights is None:
+                continue
+            scores[metric] = psnr(rendered, truth, weights)
+            if metric == "psnr_moving":
+                scores["ssim_moving"] = ssim(rendered, truth, weights)
+                scores["flip_moving"] = flip(rendered, truth, weights).value if with_flip else None
+        return scores
 
     def moving(self, image: Image) -> Tensor | None:
         """Return the moving pixels (H, W) bool, or None if unknown."""
@@ -108,13 +123,14 @@ class Regions:
         return NO_MOTION_KNOWN if self._has_times else NO_TIMES
 
 
-def _psnr_inside(
-    part: Tensor | None, image: Image, rendered: Tensor, truth: Tensor
-) -> float | None:
+def _weights(part: Tensor | None, foreground: Tensor | None, mask: Tensor | None) -> Tensor | None:
+    """Return the weights (H, W) of a region inside the foreground; None for unknown or small
+    regions."""
     if part is None:
         return None
-    weights = part.float() if image.mask is None else part * image.mask
-    return psnr(rendered, truth, weights) if int((weights > 0).sum()) >= FEWEST_PIXELS else None
+    inside = part if foreground is None else part & foreground
+    weights = inside.float() if mask is None else inside * mask
+    return weights if int((weights > 0).sum()) >= FEWEST_PIXELS else None
 
 
 @dataclass(frozen=True)
@@ -178,6 +194,8 @@ class ViewScore:
     psnr_foreground: float | None = None
     psnr_moving: float | None = None
     psnr_static: float | None = None
+    ssim_moving: float | None = None
+    flip_moving: float | None = None
     psnr_right: float | None = None
     psnr_right_fitted: float | None = None
     psnr_white: float | None = None
@@ -252,7 +270,8 @@ def score_views(
         values |= right_half_scores(image, rendering, background)
         values |= background_scores(image, rendering, background)
         if regions is not None:
-            values |= regions.scores(image, rendered, truth)
+            with_flip = values["flip"] is not None
+            values |= regions.scores(image, rendered, truth, with_flip)
         score = ViewScore(
             name=image.name,
             width=image.cameras.width,

@@ -70,6 +70,15 @@ def test_scores_are_those_of_the_pixels_of_each_region() -> None:
     rest = SIDE * SIDE - 36
     assert scores["psnr_static"] == pytest.approx(-10 * np.log10(SIDE * 1e-4 / rest), abs=1e-3)
     assert regions.reason("psnr_foreground") == NO_ALPHA
+    truth = image.rgb_premultiplied
+    assert scores["ssim_moving"] is not None
+    assert scores["ssim_moving"] < 0.99
+    assert scores["flip_moving"] is None, "FLIP was not requested"
+    exact = truth.clone()
+    exact[20:] = 0.0
+    exact = regions.scores(image, exact, truth, with_flip=True)
+    assert exact["ssim_moving"] == pytest.approx(1.0)
+    assert exact["flip_moving"] in (None, 0.0)
 
 
 def test_motion_masks_come_first_and_empty_background_counts_nowhere() -> None:
