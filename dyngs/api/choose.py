@@ -32,6 +32,8 @@ from dyngs.data.read import view_size
 from dyngs.data.times import evenly_spaced
 from dyngs.deform.keys import FreeField
 from dyngs.deform.static_errors import changed_fraction, group_fixed_cameras
+from dyngs.evaluate.motion_masks import MotionMasks
+from dyngs.evaluate.view_scores import FEWEST_PIXELS
 from dyngs.gaussians.colour.network import apply_affine_colour, fit_affine_colour
 from dyngs.io.write import write_text
 from dyngs.models.kind import HasGaussians, HasMotion, capability, find_kind
@@ -147,7 +149,8 @@ def resolve_by_pilot_runs(
     at_once = len(views) / len({view.time for view in views})
     if moves and at_once >= FILTERED_VIEWS:
         moving = _before_fixed_cameras(moving, at_once)
-    choice = _motion(moving, capture, on_progress)
+    masks = MotionMasks(capture, config.data) if moves else None
+    choice = _motion(moving, capture, on_progress, masks)
     if choice is None:
         log_info(f"model.kind=dynamic {_TOO_SHORT}; model.pilot_runs=false trains a moving scene")
         return _with_colour(as_static(config), capture, on_progress)
@@ -206,9 +209,11 @@ def _before_fixed_cameras(config: Config, views: float) -> Config:
     return config
 
 
-def _motion(config: Config, capture: Capture, on_progress: ProgressCallback) -> Choice | None:
-    """Compare ``config`` with the same model at rest; None where the run is too short, or has too
-    few views.
+def _motion(
+    config: Config, capture: Capture, on_progress: ProgressCallback, masks: MotionMasks | None
+) -> Choice | None:
+    """Compare ``config`` with the same model at rest, on the pixels of ``masks``; None where the
+    run is too short, or has too few views.
 
     Both begin as the same static model, and train on the same views in the same order: at the rates
     of the preset ``static``, a model at rest would win by its faster learning.
@@ -240,6 +245,7 @@ def _motion(config: Config, capture: Capture, on_progress: ProgressCallback) -> 
         folds,
         on_progress,
         errors=ERRORS_OF_MOTION,
+        masks=masks,
         deadline=begun + MOTION.spent * given,
     )
     seconds = max(time.monotonic() - begun, 1e-6)
@@ -281,6 +287,7 @@ def _compared(
     on_progress: ProgressCallback,
     *,
     errors: float = ERRORS,
+    masks: MotionMasks | None = None,
     deadline: float = math.inf,
 ) -> Choice | None:
     """Train both configs without each fold of the training views, and compare them on it; None
@@ -299,7 +306,7 @@ def _compared(
         one, other = (_trained(config, capture, held_out, deadline, on_step) for config in both)
         if one is None or other is None:
             return None
-        pairs += [view_psnr((one, other), index) for index in sorted(held_out)]
+        pairs += [view_psnr((one, other), index, masks) for index in sorted(held_out)]
     gains = [after - before for before, after in pairs]
     gain = fmean(gains)
     error = (stdev(gains) if len(gains) > 1 else math.inf) / math.sqrt(len(gains))
@@ -428,14 +435,23 @@ def _motion_of_fixed_cameras(capture: Capture, config: Config) -> bool | None:
 
 
 @torch.no_grad()
-def view_psnr(pair: Pair, index: int) -> list[float]:
+def view_psnr(pair: Pair, index: int, masks: MotionMasks | None = None) -> list[float]:
     """Return the PSNR, dB, of a training view by two models that were not trained on it.
 
     Where either has exposures, after an affine colour that is fitted to the view.
+
+    Args:
+        masks: score moving pixels only, in views with enough of them.
     """
     image = pair[0].images[index]
     background = background_colour(pair[0].background)
     truth = image.composite(background)
+    weights = image.mask
+    if masks is not None:
+        size = (image.cameras.width, image.cameras.height)
+        moving = masks.mask(pair[0].images.views[index], *size)
+        if moving is not None and int(moving.sum()) >= FEWEST_PIXELS:
+            weights = moving.to(truth.device).float() * (1 if weights is None else weights)
     has_exposures = any(trainer.config.train.exposure == "always" for trainer in pair)
     scores = []
     for trainer in pair:
@@ -448,5 +464,5 @@ def view_psnr(pair: Pair, index: int) -> list[float]:
         if has_exposures:
             affine = fit_affine_colour([(image, rendering)], background)
             rgb = apply_affine_colour(affine, image, rendering, background)
-        scores.append(psnr(rgb, truth, image.mask))
+        scores.append(psnr(rgb, truth, weights))
     return scores

@@ -65,6 +65,7 @@ class MotionMasks:
     def __init__(self, capture: Capture, options: DataConfig) -> None:
         timed = [view for view in all_views(capture.splits) if view.time is not None]
         self._views = sorted(timed, key=lambda view: (view.name, view.time))
+        self._indices = {view.image_path: i for i, view in enumerate(self._views)}
         self._points = None if capture.points is None else capture.points.xyz
         self._options = options
         self._fixed: dict[int, list[int]] = {}
@@ -79,9 +80,9 @@ class MotionMasks:
         None with too few times to compare, or without sparse points if cameras move and do not look
         at one point.
         """
-        if view not in self._views or len({each.time for each in self._views}) < FEWEST_TIMES:
+        index = self._indices.get(view.image_path)
+        if index is None or len({each.time for each in self._views}) < FEWEST_TIMES:
             return None
-        index = self._views.index(view)
         path = self._folder / f"{index:05d}.png"
         if not path.is_file():
             moving = self._changed(index) if index in self._fixed else self._unexplained(index)

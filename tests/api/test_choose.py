@@ -110,6 +110,46 @@ def write_rolling_ball(root: Path) -> None:
         Image.fromarray((255 * rgba).round().byte().numpy()).save(view.image_path)
 
 
+def test_only_moving_pixels_decide_about_motion_before_fixed_cameras() -> None:
+    """A walker on few pixels: a model that renders it wins, though its background is worse."""
+    truth = torch.full((20, 20, 3), 0.5)
+    moving = torch.zeros(20, 20, dtype=torch.bool)
+    moving[4:10, 4:10] = True
+    image = SimpleNamespace(
+        cameras=SimpleNamespace(width=20, height=20),
+        composite=lambda _: truth,
+        mask=None,
+        time=0.0,
+    )
+
+    class Images:
+        views = ("view",)
+
+        def __getitem__(self, _: int) -> Any:
+            return image
+
+    def trainer(rgb: torch.Tensor) -> Any:
+        scene = SimpleNamespace(render=lambda *_, **__: SimpleNamespace(rgb=rgb[None]))
+        return SimpleNamespace(
+            images=Images(),
+            background="black",
+            config=SimpleNamespace(train=SimpleNamespace(exposure="never")),
+            model=SimpleNamespace(scene=scene, options=None),
+        )
+
+    static = truth + 0.1 * moving[..., None]
+    dynamic = truth + 0.06 * ~moving[..., None]
+    pair = (trainer(static), trainer(dynamic))
+    masks: Any = SimpleNamespace(mask=lambda *_: moving)
+    before, after = module.view_psnr(pair, 0)
+    assert before > after
+    before, after = module.view_psnr(pair, 0, masks)
+    assert before == pytest.approx(20.0, abs=0.01)
+    assert after == 100.0
+    none: Any = SimpleNamespace(mask=lambda *_: torch.zeros_like(moving))
+    assert module.view_psnr(pair, 0, none) == module.view_psnr(pair, 0)
+
+
 @pytest.mark.parametrize(("moves", "steps"), [(True, 200), (False, 300)])
 def test_never_worse_than_static(
     moves: bool, steps: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
