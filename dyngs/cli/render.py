@@ -91,6 +91,9 @@ def run(arguments: argparse.Namespace) -> int:
     """Render and print the written files."""
     _check(arguments)
     written = _render(arguments)
+    if len(written) == 1:
+        print(f"written: {written[0]}")
+        return 0
     folders = sorted({str(path.parent) for path in written})
     print(f"written: {format_count(len(written), 'file')} in {', '.join(folders)}")
     for path in written:

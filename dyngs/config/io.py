@@ -475,7 +475,7 @@ def _section(
     keys = (*above, str(problem["loc"][0]))
     info = section.model_fields[keys[-1]]
     where = layers.origin_of(keys)
-    if problem["type"] == "missing":
+    if problem["type"] == "missing" and len(problem["loc"]) == 1:
         name = ".".join(keys)
         example = "data.root=FOLDER" if name == "data.root" else f"{name}=..."
         raise DyngsError(f"{where}{name} is required ({info.description}); add {example}")

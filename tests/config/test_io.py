@@ -231,6 +231,12 @@ def test_wrong_overrides_are_named_with_what_is_allowed(overrides: str, part: st
     assert part in message
 
 
+def test_a_list_that_is_too_short_is_not_called_missing() -> None:
+    message = refusal(None, ROOT, "init.kind=scene", "init.scene=a.ply", "init.box=[1, 2]")
+    assert "init.box must be" in message
+    assert "required" not in message
+
+
 def test_paths_hold_no_nul() -> None:
     assert "contains a character that is invalid in names and paths" in refusal(
         None, 'data.root="/a/\\x00"'
