@@ -83,7 +83,7 @@ MEASUREMENTS = {
     ),
     "rig": Measurement(
         "moving", "rig: four fixed cameras", "rig", "dynamic",
-        ("model.pilot_runs=false", "train.steps=6000"), in_readme=True,
+        ("train.steps=6000",), in_readme=True,
     ),
     "clip_duck": Measurement(
         "moving", "duck: a clip, one moving camera", "clip_duck", "dynamic",
