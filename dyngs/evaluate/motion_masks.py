@@ -2,8 +2,8 @@
 
 Images of a fixed camera are compared with their median over time. Other images are compared with
 images of other times, warped by all depths of the sparse points around a pixel: a pixel moves if
-two thirds of these images contradict every depth (plane sweep, Collins 1996). Differences within half a
-pixel do not count (Birchfield and Tomasi 1998).
+two thirds of these images contradict every depth (plane sweep, Collins 1996). Differences within
+half a pixel do not count (Birchfield and Tomasi 1998).
 
 Local letters: H x W pixels, C channels, N other images.
 """
@@ -173,7 +173,8 @@ class MotionMasks:
                 nearest = KDTree(positions[visible] * size).query(pixels, k=NUM_POINTS)[1]
                 found = np.sort(inverse[nearest], axis=-1)
                 # One outlier on either side is ignored.
-                low, high = found[..., 1] / MARGIN, found[..., -2] * MARGIN
+                low = found[..., 1] / MARGIN
+                high = found[..., -2] * MARGIN
                 return torch.from_numpy(low).float(), torch.from_numpy(high).float()
         poses = np.stack([invert_rigid(view.cam_from_world) for view in self._views])
         focus = focus_point(poses)

@@ -152,7 +152,7 @@ def test_frames_of_any_format_with_times(blender_root: Path) -> None:
 
 
 def test_the_ends_of_a_clip_are_trained_on(blender_root: Path) -> None:
-    """In order of time, whatever the order of names; images without times start at the first."""
+    """Frames are counted in order of time. Images without times are counted from the first."""
     (blender_root / "transforms_test.json").unlink()
     assert held_out_frames(read(blender_root, test_every=4)) == [0, 12, 2, 6]
     set_times(blender_root, "train", [float(15 - i) for i in range(16)])

@@ -105,8 +105,9 @@ class DataConfig(Section):
     test_first: int | None = Field(
         default=None,
         ge=0,
-        description="index of the first image that data.test_every holds out; null: in the middle of "
-        "the first n images if they have times, so that the ends of a clip are trained on, else 0",
+        description="index of the first image that data.test_every holds out; null: in the middle "
+        "of the first n images if they have times, so that the ends of a clip are trained on, "
+        "else 0",
     )
     background: Literal["auto", "white", "black", "random"] = Field(
         default="auto",
