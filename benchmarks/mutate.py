@@ -90,7 +90,7 @@ MUTATIONS = (
     ("gaussians/schedule.py", "(1 - progress) * math.log(options.lr_means)", "progress * math.log(options.lr_means)", "gaussians/test_schedule.py"),
     ("training/corrections/exposure.py", "composite(view.background) >= SATURATED", "composite(view.background) >= 9", "training/corrections/test_exposure.py"),
     ("evaluate/motion_masks.py", "2 * at[..., :2]", "3 * at[..., :2]", "evaluate/test_motion_masks.py"),
-    ("evaluate/view_scores.py", "else x & foreground", "else x", "evaluate/test_regions.py"),
+    ("evaluate/view_scores.py", "else part & foreground", "else part", "evaluate/test_regions.py"),
     ("evaluate/view_scores.py", "psnr(rendering.rgb[0][:, middle:], truth[:, middle:], mask)", "psnr(rendering.rgb[0][:, :middle], truth[:, :middle], mask)", "evaluate/test_view_scores.py"),
     ("evaluate/view_scores.py", "rendering.transmittance[0][..., None] * background", "0 * background", "evaluate/test_view_scores.py"),
     ("compress/stage.py", "VOLUME_POWER = 0.1", "VOLUME_POWER = -0.1", "compress/test_scores.py"),
