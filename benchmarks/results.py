@@ -404,8 +404,10 @@ def comparison_table(found: Sequence[Mapping[str, Any]]) -> str:
         f"{table(rows)}\n\n"
         f"{', '.join(minutes)} minutes of training on one thread; mean over seeds ± half the range.\n"
         "What moves: pixels of motion masks, else of fixed cameras, the same for all variants; empty\n"
-        "without both. Foreground: where images have alpha. Load of the machine (1 minute average)\n"
-        f"during the trainings: {min(loads):.1f} to {max(loads):.1f}.\n{''.join(refused)}"
+        "without both. Fixed cameras were compared with the median of their held-out frames alone;\n"
+        "`dyngs eval` now takes all frames and gives other values. Foreground: where images have\n"
+        f"alpha. Load of the machine (1 minute average): {min(loads):.1f} to {max(loads):.1f}.\n"
+        f"{''.join(refused)}"
     )
 
 

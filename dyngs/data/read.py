@@ -418,7 +418,7 @@ def _held_out(views: tuple[View, ...], options: DataConfig) -> set[str]:
         return set()
     first = options.test_first
     if first is None and views[0].time is not None:
-        # The ends of a clip are trained on, because nothing can be extrapolated.
+        # The ends of a clip are trained on, because motion beyond them cannot be extrapolated.
         clip = sorted(views, key=lambda view: (view.camera_id, view.time or 0.0, view.name))
         inner = clip[every // 2 : -1 : every]
         if inner:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -22,6 +23,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample, interpolate, max_pool2d, pad
 
 from dyngs.config import DataConfig
+from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, View, all_views
 from dyngs.data.geometry import camera_center, focus_point, invert_rigid, project_points
 from dyngs.data.images.images import read_mask
@@ -84,13 +86,17 @@ class MotionMasks:
         if index is None or len({each.time for each in self._views}) < FEWEST_TIMES:
             return None
         path = self._folder / f"{index:05d}.png"
-        if not path.is_file():
+        moving = None
+        if path.is_file():
+            with suppress(DyngsError):  # A damaged file is estimated again.
+                moving = read_mask(path)
+        if moving is None:
             moving = self._changed(index) if index in self._fixed else self._unexplained(index)
             if moving is None:
                 return None
             write_image(path, (255 * moving).byte().numpy())
-        stored = read_mask(path)[None, None].float()
-        return interpolate(stored, (height, width), mode="bilinear")[0, 0] >= 0.5
+        resized = interpolate(moving[None, None].float(), (height, width), mode="bilinear")
+        return resized[0, 0] >= 0.5
 
     @cached_property
     def _folder(self) -> Path:
@@ -220,8 +226,10 @@ class _SmallImage:
 def _smallest_error(
     image: _SmallImage, others: Sequence[_SmallImage], low: Tensor, high: Tensor
 ) -> Tensor:
-    """Return the smallest error (H, W) over depths: the quantile over the other images of the
-    colour difference, mean over channels and 3x3 pixels. 0 where too few of them contain the pixel.
+    """Return the smallest error (H, W) of all depths.
+
+    The error of a depth is a quantile over the other images of the colour difference, which is
+    averaged over channels and 3x3 pixels. It is 0 where too few other images contain the pixel.
 
     Args:
         low, high: (H, W) range of inverse depth.
@@ -234,14 +242,18 @@ def _smallest_error(
     )
     pixels = torch.stack([across, down, torch.ones_like(down)], dim=-1).double()
     rays = pixels @ torch.linalg.inv(image.intrinsics).T
+    world_from_cam = torch.linalg.inv(image.pose)
+    # Homogeneous pixels of the other images are linear in the inverse depth.
+    lines = []
+    for other in others:
+        relative = other.pose @ world_from_cam
+        direction = (rays @ (other.intrinsics @ relative[:3, :3]).T).float()
+        lines.append((direction, (other.intrinsics @ relative[:3, 3]).float()))
     smallest = torch.full((height, width), torch.inf, device="cpu")
     for step in torch.linspace(0, 1, NUM_DEPTHS, device="cpu"):
         inverse = low + step * (high - low)
         errors = []
-        for other in others:
-            relative = other.pose @ torch.linalg.inv(image.pose)
-            direction = (rays @ (other.intrinsics @ relative[:3, :3]).T).float()
-            origin = (other.intrinsics @ relative[:3, 3]).float()
+        for other, (direction, origin) in zip(others, lines, strict=True):
             at = direction + origin * inverse[..., None]
             size = torch.tensor(other.rgb.shape[:0:-1], device="cpu")
             grid = 2 * at[..., :2] / at[..., 2:].clamp_min(1e-9) / size - 1

@@ -127,6 +127,9 @@ def test_masks_are_stored_by_the_images(tmp_path: Path, monkeypatch: pytest.Monk
     assert mask is not None
     assert mask.shape == (16, 16)
     assert mask.all()
+    (folder / "00001.png").write_bytes(b"damaged")
+    for damaged, _ in masks_of(root):
+        assert damaged.shape == (SIDE, SIDE)
     write_clip(root, 6, noise=0.01)
     mask = MotionMasks(capture, options).mask(view, 16, 16)
     assert mask is not None
