@@ -11,7 +11,7 @@ import torch
 
 from dyngs.core.camera import Cameras
 from dyngs.data.loader import Image
-from dyngs.deform.fixed_cameras.hulls import FixedCameraClip, build_fixed_camera_clip
+from dyngs.deform.fixed_cameras import FixedCameraClip, build_fixed_camera_clip
 
 SIZE, FOCAL = 64, 80.0
 BLACK = torch.zeros(3)

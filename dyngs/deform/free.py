@@ -22,7 +22,7 @@ from dyngs.deform.field import (
     OpacityWindow,
     select_rows,
 )
-from dyngs.deform.fixed_cameras.initial_motion import TimedGaussians
+from dyngs.deform.initial_motion import TimedGaussians
 from dyngs.deform.keys import COPIES_OF_MOVING, FreeField
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.optimizer import Parameters
@@ -160,14 +160,14 @@ def initialize_free(
             FAINT_LOGIT if timed_gaussians else math.inf
         )
     )
-    no_motion = torch.zeros(3, device="cpu")
+    no_motion = torch.zeros(len(faint), 3, device="cpu")
     parts = [TimedGaussians((i + 0.5) / copies, faint, no_motion) for i in range(copies)]
     groups = [*parts, *timed_gaussians]
     sizes = torch.tensor([len(one.gaussians) for one in groups], device="cpu")
     centers = torch.tensor([one.time for one in groups], device="cpu")
     spans = torch.full_like(centers, FIRST_SPAN / max(num_times - 1, 1))
     spans[:copies] = 1 / copies
-    velocities = torch.stack([one.velocity for one in groups]).repeat_interleave(sizes, dim=0)
+    velocities = torch.cat([one.velocities for one in groups])
     other_times = torch.linspace(0, 1, len(others), device="cpu")
     return FreeInitialization(
         faint.logit_opacities,

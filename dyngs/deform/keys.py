@@ -234,8 +234,8 @@ class DynamicModel(SceneModel):
     num_random_moving: int = Field(
         default=4000,
         ge=0,
-        description="moving Gaussians added when motion starts: random ones, or, for free primitives with "
-        "fixed cameras, at most this many on moving objects and as many on changing surfaces",
+        description="moving Gaussians added when motion starts: random ones, or, for Gaussians with a "
+        "lifetime before fixed cameras, at most twice this many where images change",
     )
     time_window: Fraction = Field(
         default=1.0,

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dyngs.core.errors import DyngsError
 from dyngs.data.times import evenly_spaced
 from dyngs.deform.bodies.paths import FrameStack, order_moving_camera, render_frame_stack
-from dyngs.deform.fixed_cameras.hulls import FixedCameraClip, build_fixed_camera_clip
+from dyngs.deform.fixed_cameras import FixedCameraClip, build_fixed_camera_clip
 from dyngs.deform.keys import DynamicModel
 from dyngs.deform.kind import DYNAMIC
 from dyngs.deform.scene import DynamicScene
@@ -36,7 +36,7 @@ from dyngs.models.kind import StartContext
 from dyngs.models.schedule import image_divisor
 from dyngs.models.views import evaluation_background, training_cameras, training_times
 
-MAX_FIXED_CAMERAS = 12  # most fixed cameras in which tracks are searched
+MAX_FIXED_CAMERAS = 12  # most fixed cameras in which motion is searched
 MAX_SEARCHED_IMAGES = 150  # most images of a moving camera in which rigid bodies are searched
 # Training steps per searched image, because the search takes as long as ten steps.
 STEPS_PER_IMAGE = 50
@@ -118,5 +118,4 @@ def _training_views(
         has_fixed_cameras=bool(in_place),
         fixed_clips=fixed_clips,
         frame_stack=frame_stack,
-        options=options,
     )

@@ -13,7 +13,7 @@ from dyngs.core.camera import Cameras
 from dyngs.data.capture import View
 from dyngs.data.loader import Image
 from dyngs.data.times import evenly_spaced, static_cameras
-from dyngs.deform.fixed_cameras.hulls import median_image
+from dyngs.deform.fixed_cameras import median_image
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, Shader, render
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -21,10 +21,10 @@ from dyngs.deform.bodies.rigid_bodies import Bodies, find_bodies
 from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.field import DeformationField, FieldSetup, Offsets, apply_offsets, innermost
 from dyngs.deform.fields import WindowedField, create_field
-from dyngs.deform.fixed_cameras.hulls import FixedCameraClip
-from dyngs.deform.fixed_cameras.initial_motion import InitialMotion, find_initial_motion
+from dyngs.deform.fixed_cameras import FixedCameraClip
 from dyngs.deform.free import FreeInitialization, FreePrimitives, initialize_free
 from dyngs.deform.gaussians_4d import Gaussians4D
+from dyngs.deform.initial_motion import InitialMotion, find_initial_motion
 from dyngs.deform.keys import TIMED_FIELDS, DynamicModel, MlpField
 from dyngs.deform.random_gaussians import box_of, random_gaussians, with_gaussians
 from dyngs.deform.scene import DynamicScene
@@ -33,7 +33,6 @@ from dyngs.deform.static_errors import StaticErrors, otsu_threshold
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.filters import FILTER_VARIANCE, FilterUpdate, filter_std
 from dyngs.gaussians.model import SceneTraining
-from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianTimeStep
 from dyngs.ops.adam import Count
 
@@ -113,7 +112,6 @@ class TrainingViews:
     # Returns the images of one moving camera and the renderings of N static Gaussians; None if no
     # single moving camera took the images.
     frame_stack: Callable[[Gaussians], FrameStack | None] = lambda _: None
-    options: RenderOptions = field(default_factory=RenderOptions)  # of training images
 
 
 class DynamicTraining(SceneTraining[DynamicScene]):
@@ -330,11 +328,11 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         """Find motion in front of fixed cameras, for Gaussians with a lifetime."""
         if not self._has_lifetimes:
             return InitialMotion()
-        capture = self.capture
-        limit = self.options.num_random_moving
-        static = static.to(device="cpu")
         return find_initial_motion(
-            capture.fixed_clips(), static, capture.extent, limit, capture.options
+            self.capture.fixed_clips(),
+            static,
+            self.capture.extent,
+            2 * self.options.num_random_moving,
         )
 
     def _add_windows(self, scene: DynamicScene, step: int) -> DynamicScene:

@@ -11,8 +11,8 @@ from tiny_fields import cloud, stir, tiny_setup
 from dyngs.api.train import train
 from dyngs.config.io import load_config
 from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
-from dyngs.deform.fixed_cameras.initial_motion import TimedGaussians
 from dyngs.deform.free import MIN_SPAN, FreeInitialization, FreePrimitives, initialize_free
+from dyngs.deform.initial_motion import TimedGaussians
 from dyngs.deform.keys import FreeField
 from dyngs.evaluate.report import evaluate_run
 from dyngs.gaussians import TopologyEdit
@@ -92,7 +92,7 @@ def test_static_gaussians_are_copied_over_the_clip_and_moments_have_their_times(
     static = cloud(3)
     thing = cloud(5)
     others = cloud(4)
-    velocity = torch.tensor([1.0, 0.0, 2.0])
+    velocity = torch.tensor([1.0, 0.0, 2.0]).expand(5, 3)
     start = initialize_free(static, [TimedGaussians(0.25, thing, velocity)], others, num_times=10)
     assert [len(x) for x in start.added] == [3] * 9 + [5, 4]
     assert len(start.centers) == len(start.spans) == len(start.velocities) == 30 + 5 + 4
@@ -100,7 +100,7 @@ def test_static_gaussians_are_copied_over_the_clip_and_moments_have_their_times(
     assert (start.spans[:30] == 0.1).all()
     assert (start.centers[30:35] == 0.25).all()
     assert (start.spans[30:35] < GAP).all()
-    assert torch.equal(start.velocities[30:35], velocity.expand(5, 3))
+    assert torch.equal(start.velocities[30:35], velocity)
     assert not start.velocities[35:].any()
 
 

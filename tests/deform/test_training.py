@@ -383,7 +383,7 @@ def test_motion_starts_at_changes_of_fixed_cameras() -> None:
     result = run.grow(FINE)
     assert result is not None
     assert result.message is not None
-    assert "found moving objects at 8 of 8 times" in result.message
+    assert "found motion at 8 of 8 times" in result.message
     assert run.training.trains_on(0.0, FINE + 1)
     copies = 3 * len(times)  # of the static Gaussians that move: one for each time
     assert copies < run.scene.num_moving <= copies + 2 * 800

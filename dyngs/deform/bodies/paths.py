@@ -21,7 +21,7 @@ from torch import Tensor
 from dyngs.data.capture import View
 from dyngs.data.loader import Image
 from dyngs.data.times import static_cameras
-from dyngs.deform.fixed_cameras.hulls import detect_shadows
+from dyngs.deform.fixed_cameras import detect_shadows
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, Shader, render
 

@@ -8,7 +8,7 @@ import torch
 from static_balls import BLACK, Ball, cameras, drawn, filmed
 
 from dyngs.data.loader import Image
-from dyngs.deform.fixed_cameras.hulls import LONGEST_SIDE, build_fixed_camera_clip, detect_changes
+from dyngs.deform.fixed_cameras import LONGEST_SIDE, build_fixed_camera_clip, detect_changes
 
 TIMES = tuple(i / 8 for i in range(9))
 
