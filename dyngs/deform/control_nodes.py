@@ -160,7 +160,7 @@ class ControlNodes(DeformationField):
     def __init__(
         self, options: ControlNodesField, setup: FieldSetup, generator: torch.Generator
     ) -> None:
-        self.options, self.setup = options, setup
+        self.options, self.setup = options.resolved(), setup
         self.num_pieces = options.pieces or min(
             max(1, round(PIECES_PER_TIME * setup.num_times)), MAX_KEY_TIMES
         )
@@ -286,6 +286,7 @@ class ControlNodes(DeformationField):
             name: torch.zeros(count, self.num_points, size, device=device)
             for name, size in sizes.items()
         }
+        assert self.options.lr_means is not None
         rates = {"means": self.options.lr_means * self.setup.extent} | LR
         return Parameters(tensors, {name: rates[name] for name in sizes}, LR_DECAY)
 

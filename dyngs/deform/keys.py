@@ -11,6 +11,10 @@ from dyngs.core.section import Fraction, Positive, SceneModel, Section
 COPIES_OF_MOVING = 12_000
 """Most copies over time of the moving Gaussians that free primitives start with."""
 
+CLIP_NODES, JUMPING_NODES = (2048, 1.2e-3), (512, 6e-4)
+"""Number of nodes and their learning rate. In clips, neighbouring frames show a pose from nearly
+the same side, so that more and faster nodes gain 0.9 dB on what moves (`clip_dog`). Where cameras
+jump, each pose has one image, and the same nodes lose 2.5 dB (`flag`)."""
 
 Weight = Annotated[float, Field(ge=0)]
 Attribute = Literal["rotations", "scales", "opacities", "colors"]
@@ -122,14 +126,21 @@ class ControlNodesField(FieldSection):
         default="control_nodes",
         description="sparse control nodes on cubic splines that Gaussians follow (after SC-GS); no network",
     )
-    nodes: int = Field(default=512, ge=1, description="number of control nodes")
+    nodes: int = Field(
+        default=0,
+        ge=0,
+        description="number of control nodes; 0: 2048 for clips, where successive cameras differ by "
+        "less than 10 degrees, otherwise 512",
+    )
     pieces: int = Field(
         default=0,
         ge=0,
         description="polynomial pieces per spline; 0: 0.3 times the number of training times",
     )
-    lr_means: Positive = Field(
-        default=6e-4, description="learning rate of the node positions, times the scene extent"
+    lr_means: Positive | None = Field(
+        default=None,
+        description="learning rate of the node positions, times the scene extent; null: 1.2e-3 for "
+        "clips, otherwise 6e-4",
     )
     rigidity: float = Field(
         default=0.5,
@@ -137,6 +148,12 @@ class ControlNodesField(FieldSection):
         description="weight of the as-rigid-as-possible loss: squared strain between neighbouring nodes, in node "
         "spacings; lower it for objects that bend",
     )
+
+    def resolved(self, is_clip: bool = False) -> ControlNodesField:
+        """Return the section with the number of nodes and the learning rate filled in."""
+        nodes, rate = CLIP_NODES if is_clip else JUMPING_NODES
+        lr_means = rate if self.lr_means is None else self.lr_means
+        return self.model_copy(update={"nodes": self.nodes or nodes, "lr_means": lr_means})
 
 
 class FreeField(Section):

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+
+import numpy as np
 
 from dyngs.core.errors import DyngsError
+from dyngs.data.capture import View
 from dyngs.data.times import evenly_spaced
 from dyngs.deform.bodies.paths import FrameStack, order_moving_camera, render_frame_stack
 from dyngs.deform.fixed_cameras import FixedCameraClip, build_fixed_camera_clip
-from dyngs.deform.keys import DynamicModel
+from dyngs.deform.keys import ControlNodesField, DynamicModel
 from dyngs.deform.kind import DYNAMIC
 from dyngs.deform.scene import DynamicScene
 from dyngs.deform.schedule import deform_schedule
@@ -36,6 +39,7 @@ from dyngs.models.kind import StartContext
 from dyngs.models.schedule import image_divisor
 from dyngs.models.views import evaluation_background, training_cameras, training_times
 
+CLIP_ANGLE = 10.0  # largest median angle, degrees, between successive cameras of a clip
 MAX_FIXED_CAMERAS = 12  # most fixed cameras in which motion is searched
 MAX_SEARCHED_IMAGES = 150  # most images of a moving camera in which rigid bodies are searched
 # Training steps per searched image, because the search takes as long as ten steps.
@@ -53,6 +57,9 @@ def start(run: StartContext) -> GaussianModel:
     problem = DYNAMIC.refusal(run.capture)
     if problem is not None:
         raise DyngsError(f"{run.config.data.root}: {problem}")
+    if isinstance(model.deform, ControlNodesField):
+        deform = model.deform.resolved(is_clip(run.capture.splits["train"]))
+        model = model.model_copy(update={"deform": deform})
     gaussians = load_or_create_gaussians(run)
     colours = build_colour_training(run, gaussians, uses_time=True)
     schedule = deform_schedule(model, rate_schedule(run.config))
@@ -61,6 +68,17 @@ def start(run: StartContext) -> GaussianModel:
     return GaussianModel(
         run, training.first_scene(gaussians), training, build_densifier(run), colours
     )
+
+
+def is_clip(views: Sequence[View]) -> bool:
+    """Return whether one smoothly moving camera took the views."""
+    order = order_moving_camera(views)
+    if order is None or len(order) < 2:
+        return False
+    rotations = np.stack([views[i].cam_from_world[:3, :3] for i in order])
+    traces = np.einsum("nij,nij->n", rotations[1:], rotations[:-1])
+    angles = np.degrees(np.arccos(np.clip(0.5 * (traces - 1), -1, 1)))
+    return float(np.median(angles)) < CLIP_ANGLE
 
 
 def restore(model: DynamicModel, checkpoint: Checkpoint) -> DynamicScene:

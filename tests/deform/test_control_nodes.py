@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
+import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -12,8 +16,10 @@ from tiny_fields import cloud, tiny_setup
 from torch import Tensor
 
 from dyngs.core.state import strip_roles
+from dyngs.data.capture import View
 from dyngs.deform.control_nodes import ControlNodes
-from dyngs.deform.keys import ControlNodesField
+from dyngs.deform.keys import CLIP_NODES, JUMPING_NODES, ControlNodesField
+from dyngs.deform.start import is_clip
 from dyngs.gaussians import TopologyEdit
 
 MEANS_ONLY = {"moves": ()}
@@ -186,3 +192,33 @@ def test_motion_is_extrapolated_at_constant_velocity() -> None:
 
 # --- rigid groups
 # -------------------------------------------------------------------------------------------------
+
+
+def turning_views(degrees: float, num_times: int = 8) -> list[View]:
+    """Views at successive times by a camera that turns by ``degrees`` between them."""
+    views = []
+    for i in range(num_times):
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.from_euler("y", degrees * i, degrees=True).as_matrix()
+        views.append(View(f"{i}", Path(f"{i}.png"), pose, np.eye(3), 4, 4, time=i / num_times))
+    return views
+
+
+@pytest.mark.parametrize(("degrees", "expected"), [(1.0, True), (80.0, False), (0.0, False)])
+def test_clips_are_taken_by_smoothly_moving_cameras(degrees: float, expected: bool) -> None:
+    """A camera that does not move is a fixed one."""
+    assert is_clip(turning_views(degrees)) is expected
+
+
+def test_several_cameras_are_no_clip() -> None:
+    views = turning_views(1.0)
+    same_time = [replace(view, time=0.5 * (i % 2)) for i, view in enumerate(views)]
+    assert not is_clip(same_time)
+
+
+def test_requested_numbers_of_nodes_are_kept() -> None:
+    for is_a_clip, (nodes, rate) in ((True, CLIP_NODES), (False, JUMPING_NODES)):
+        resolved = ControlNodesField().resolved(is_a_clip)
+        assert (resolved.nodes, resolved.lr_means) == (nodes, rate)
+        requested = ControlNodesField(nodes=7, lr_means=0.1)
+        assert requested.resolved(is_a_clip) == requested
