@@ -160,7 +160,8 @@ class ControlNodes(DeformationField):
     def __init__(
         self, options: ControlNodesField, setup: FieldSetup, generator: torch.Generator
     ) -> None:
-        self.options, self.setup = options.resolved(), setup
+        self.options = options.resolved()
+        self.setup = setup
         self.num_pieces = options.pieces or min(
             max(1, round(PIECES_PER_TIME * setup.num_times)), MAX_KEY_TIMES
         )

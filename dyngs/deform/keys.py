@@ -125,7 +125,8 @@ class ControlNodesField(FieldSection):
 
     kind: Literal["control_nodes"] = Field(
         default="control_nodes",
-        description="sparse control nodes on cubic splines that Gaussians follow (after SC-GS); no network",
+        description="sparse control nodes on cubic splines that Gaussians follow (after SC-GS); no "
+        "network",
     )
     nodes: int = Field(
         default=0,
@@ -252,8 +253,8 @@ class DynamicModel(SceneModel):
     num_random_moving: int = Field(
         default=4000,
         ge=0,
-        description="moving Gaussians added when motion starts: random ones, or, for Gaussians with a "
-        "lifetime before fixed cameras, at most twice this many where images change",
+        description="moving Gaussians added when motion starts: random ones, or, for Gaussians with "
+        "a lifetime before fixed cameras, at most twice this many where images change",
     )
     time_window: Fraction = Field(
         default=1.0,
