@@ -13,9 +13,9 @@ COPIES_OF_MOVING = 12_000
 
 CLIP_NODES, JUMPING_NODES = (2048, 1.2e-3), (512, 3e-4)
 """Number of nodes and their learning rate. In clips, neighbouring frames show a pose from nearly
-the same side, so that more and faster nodes gain 0.9 dB on what moves (`clip_dog`). Where cameras
-jump, each pose has one image: the same nodes lose 2.5 dB on `flag`, and a rate of 3e-4 gains
-1.0 and 1.7 dB (two seeds) over 6e-4."""
+the same side, so that more and faster nodes gain 0.9 and 0.5 dB on what moves (`clip_dog`, two
+seeds). Where cameras jump, each pose has one image: the same nodes lose 2.5 dB on `flag`, and a
+rate of 3e-4 gains 1.0 and 1.7 dB (two seeds) over 6e-4."""
 
 Weight = Annotated[float, Field(ge=0)]
 Attribute = Literal["rotations", "scales", "opacities", "colors"]
