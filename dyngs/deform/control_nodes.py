@@ -160,7 +160,7 @@ class ControlNodes(DeformationField):
     def __init__(
         self, options: ControlNodesField, setup: FieldSetup, generator: torch.Generator
     ) -> None:
-        self.options = options.resolved()
+        self.options = options.resolve_nodes()
         self.setup = setup
         self.num_pieces = options.pieces or min(
             max(1, round(PIECES_PER_TIME * setup.num_times)), MAX_KEY_TIMES

@@ -21,12 +21,12 @@ from dyngs.gaussians import Gaussians
 
 RAYS = 20_000  # points per time that are drawn, over all cameras
 SELECTION = 4  # points in the hull per point that is kept
-MIN_POINTS = 4  # fewest points of a time
+MIN_POINTS = 4  # fewest points of a time; more than ``NEIGHBOURS``
 MIN_CAMERAS = 3  # cameras that must see a change, or all there are
 OCCLUDED_FRACTION = 0.25  # largest fraction of the cameras in which a point may be occluded
 SCALE = 0.6  # standard deviation of a Gaussian, in distances to the nearest others
-NEIGHBOURS = 3
-MATCHED = 400  # most points of a time that are matched to the next time
+NEIGHBOURS = 3  # nearest other points, whose mean distance sets the size of a Gaussian
+MATCHED = 400  # most points of a time that are matched to a neighbouring time
 NEAREST = 15  # matched points that determine the velocity of a Gaussian
 LOGIT = 1.4  # opacity 0.8
 MARGIN = 0.25  # margin around static Gaussians and cameras, in sides of their box
@@ -116,13 +116,8 @@ def find_initial_motion(
         drawn = generator.permutation(len(points))[: SELECTION * count]
         kept = drawn[np.argsort(spread[drawn])[:count]]
         gaussians = _gaussians_at(points[kept], colours[kept], static.sh.shape[1])
-        paces = [np.zeros_like(points)]
-        for j in (i - 1, i + 1):
-            shifts = _shifts(points, found[j][0]) if 0 <= j < len(times) else None
-            if shifts is not None:
-                paces.append(shifts / (times[j] - time))
-        pace = np.sum(paces, axis=0) / max(len(paces) - 1, 1)
-        velocities = torch.from_numpy(pace[kept]).float()
+        around = [(times[j] - time, found[j][0]) for j in (i - 1, i + 1) if 0 <= j < len(times)]
+        velocities = torch.from_numpy(_estimate_velocities(points, around)[kept]).float()
         timed.append(TimedGaussians(time, gaussians, velocities))
     if not timed:
         return InitialMotion()
@@ -195,7 +190,20 @@ def _box(clips: Sequence[FixedCameraClip], static: Gaussians, extent: float) -> 
     return np.stack([low - margin, high + margin])
 
 
-def _shifts(points: np.ndarray, others: np.ndarray) -> np.ndarray | None:
+def _estimate_velocities(
+    points: np.ndarray, around: Sequence[tuple[float, np.ndarray]]
+) -> np.ndarray:
+    """Return the mean velocities (P, 3) of ``points`` to the points ``around`` them in time, given
+    with their time differences; 0 where no hull matches."""
+    velocities: list[np.ndarray] = []
+    for time_difference, others in around:
+        shifts = _estimate_shifts(points, others)
+        if shifts is not None:
+            velocities.append(shifts / time_difference)
+    return np.mean(velocities, axis=0) if velocities else np.zeros_like(points)
+
+
+def _estimate_shifts(points: np.ndarray, others: np.ndarray) -> np.ndarray | None:
     """Return the shifts (P, 3) of ``points`` to ``others`` (Q, 3), of the hull at another time;
     None if the hulls differ too much.
 

@@ -11,11 +11,15 @@ from dyngs.core.section import Fraction, Positive, SceneModel, Section
 COPIES_OF_MOVING = 12_000
 """Most copies over time of the moving Gaussians that free primitives start with."""
 
-CLIP_NODES, JUMPING_NODES = (2048, 1.2e-3), (512, 3e-4)
-"""Number of nodes and their learning rate. In clips, neighbouring frames show a pose from nearly
-the same side, so that more and faster nodes gain 0.9 and 0.5 dB on what moves (`clip_dog`, two
-seeds). Where cameras jump, each pose has one image: the same nodes lose 2.5 dB on `flag`, and a
-rate of 3e-4 gains 1.0 and 1.7 dB (two seeds) over 6e-4."""
+CLIP_NODES = 2048, 1.2e-3
+JUMPING_NODES = 512, 3e-4
+"""Numbers of nodes and their learning rates, for clips and for cameras that jump.
+
+In clips, neighbouring frames show a pose from nearly the same side, so that more and faster nodes
+gain 0.9 and 0.5 dB on what moves (`clip_dog`, two seeds). Where cameras jump, each pose has one
+image: the same nodes lose 2.5 dB on `flag`, and a rate of 3e-4 gains 1.0 and 1.7 dB (two seeds)
+over 6e-4.
+"""
 
 Weight = Annotated[float, Field(ge=0)]
 Attribute = Literal["rotations", "scales", "opacities", "colors"]
@@ -125,14 +129,14 @@ class ControlNodesField(FieldSection):
 
     kind: Literal["control_nodes"] = Field(
         default="control_nodes",
-        description="sparse control nodes on cubic splines that Gaussians follow (after SC-GS); no "
-        "network",
+        description="sparse control nodes on cubic splines that Gaussians follow (after SC-GS); "
+        "no network",
     )
     nodes: int = Field(
         default=0,
         ge=0,
-        description="number of control nodes; 0: 2048 for clips, where successive cameras differ by "
-        "less than 10 degrees, otherwise 512",
+        description="number of control nodes; 0: 2048 for clips, where successive cameras differ "
+        "by less than 10 degrees, otherwise 512",
     )
     pieces: int = Field(
         default=0,
@@ -151,7 +155,7 @@ class ControlNodesField(FieldSection):
         "spacings; lower it for objects that bend",
     )
 
-    def resolved(self, is_clip: bool = False) -> ControlNodesField:
+    def resolve_nodes(self, is_clip: bool = False) -> ControlNodesField:
         """Return the section with the number of nodes and the learning rate filled in."""
         nodes, rate = CLIP_NODES if is_clip else JUMPING_NODES
         lr_means = rate if self.lr_means is None else self.lr_means
@@ -253,8 +257,8 @@ class DynamicModel(SceneModel):
     num_random_moving: int = Field(
         default=4000,
         ge=0,
-        description="moving Gaussians added when motion starts: random ones, or, for Gaussians with "
-        "a lifetime before fixed cameras, at most twice this many where images change",
+        description="moving Gaussians added when motion starts: random ones, or, for Gaussians "
+        "with a lifetime before fixed cameras, at most twice this many where images change",
     )
     time_window: Fraction = Field(
         default=1.0,

@@ -58,7 +58,7 @@ def start(run: StartContext) -> GaussianModel:
     if problem is not None:
         raise DyngsError(f"{run.config.data.root}: {problem}")
     if isinstance(model.deform, ControlNodesField):
-        deform = model.deform.resolved(is_clip(run.capture.splits["train"]))
+        deform = model.deform.resolve_nodes(is_clip(run.capture.splits["train"]))
         model = model.model_copy(update={"deform": deform})
     gaussians = load_or_create_gaussians(run)
     colours = build_colour_training(run, gaussians, uses_time=True)
@@ -71,7 +71,8 @@ def start(run: StartContext) -> GaussianModel:
 
 
 def is_clip(views: Sequence[View]) -> bool:
-    """Return whether one smoothly moving camera took the views."""
+    """Return whether the views come from one camera that turns slowly, by the median angle between
+    successive poses."""
     order = order_moving_camera(views)
     if order is None or len(order) < 2:
         return False

@@ -218,7 +218,7 @@ def test_several_cameras_are_no_clip() -> None:
 
 def test_requested_numbers_of_nodes_are_kept() -> None:
     for is_a_clip, (nodes, rate) in ((True, CLIP_NODES), (False, JUMPING_NODES)):
-        resolved = ControlNodesField().resolved(is_a_clip)
+        resolved = ControlNodesField().resolve_nodes(is_a_clip)
         assert (resolved.nodes, resolved.lr_means) == (nodes, rate)
         requested = ControlNodesField(nodes=7, lr_means=0.1)
-        assert requested.resolved(is_a_clip) == requested
+        assert requested.resolve_nodes(is_a_clip) == requested
