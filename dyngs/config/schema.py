@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, Literal, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
@@ -99,11 +99,13 @@ def allowed_values(info: FieldInfo, plural: bool = False) -> str:
     black``."""
     annotation = info.annotation
     optional = NoneType in get_args(annotation)
-    plain = (
+    plain: Any = (
         next((a for a in get_args(annotation) if a is not NoneType), annotation)
         if optional
         else annotation
     )
+    if get_origin(plain) is Annotated:  # an optional type with bounds of its own
+        return allowed_values(FieldInfo.from_annotation(plain), plural) + " or null"
     one = {bool: "true or false", int: "an integer", float: "a number", str: "text", Path: "a path"}
     many = {bool: "true or false", int: "integers", float: "numbers", str: "texts", Path: "paths"}
     choices = list_choices(plain)
@@ -118,7 +120,7 @@ def allowed_values(info: FieldInfo, plural: bool = False) -> str:
         items = allowed_values(FieldInfo.from_annotation(get_args(plain)[0]), plural=True)
         text = f"a {'non-empty ' if some else ''}list of {items}"
     else:
-        text = (many if plural else one).get(plain, str(plain))  # type: ignore[arg-type]
+        text = (many if plural else one).get(plain, str(plain))
     symbols = {"multiple_of": "a multiple of", "gt": ">", "ge": ">=", "lt": "<", "le": "<="}
     bounds = [
         f"{symbol} {getattr(item, name):g}"

@@ -22,3 +22,9 @@ def test_known_rows() -> None:
     }
     for key, found in expected.items():
         assert (rows[key].allowed, rows[key].default) == found, key
+
+
+def test_optional_numbers_with_bounds_are_described_in_words() -> None:
+    kinds = {key.allowed for key in config_keys() if key.name == "model.deform.lr_means"}
+    assert "a number > 0 or null" in kinds
+    assert not any("Annotated" in key.allowed for key in config_keys())
