@@ -68,6 +68,8 @@ COLOUR = _Size(side=128, gaussians=15_000, steps=2000, fewest_steps=1000, spent=
 MOTION = _Size(side=96, gaussians=5000, steps=600, fewest_steps=600, spent=0.25)
 """In 300 steps the motion of a turning head is not found yet."""
 MOTION_RANDOM = 1000  # Most random Gaussians that motion begins with in a pilot run
+STATIC_CHECK_FRACTION = 0.08
+"""Largest fraction of ``train.minutes`` for the search for motion."""
 FEWEST_MOVING = 1500
 """Steps from which motion is followed in time: in 500 a moving scene loses up to 0.6 dB to a static
 model of it, in 3,000 it gains."""
@@ -150,6 +152,9 @@ def resolve_by_pilot_runs(
     if moves and at_once >= FILTERED_VIEWS:
         moving = _before_fixed_cameras(moving, at_once)
     masks = MotionMasks(capture, config.data) if moves else None
+    if moves is None and not _finds_motion(moving, capture, on_progress):
+        log_info("nothing moves: a static model explains all images, trained as a static scene")
+        return _with_colour(as_static(config), capture, on_progress)
     choice = _motion(moving, capture, on_progress, masks)
     if choice is None:
         log_info(f"model.kind=dynamic {_TOO_SHORT}; model.pilot_runs=false trains a moving scene")
@@ -207,6 +212,31 @@ def _before_fixed_cameras(config: Config, views: float) -> Config:
         early = {k: x for k, x in EARLY.items() if k not in config.train.model_fields_set}
         config = _with(_with(config, "model", deform=FreeField()), "train", **early)
     return config
+
+
+def _finds_motion(config: Config, capture: Capture, on_progress: ProgressCallback) -> bool:
+    """Return whether motion may explain what the static model that the run begins with does not.
+
+    Pilot runs cannot tell: their static model is too short. Photos of a static scene in temporal
+    order gained 1.5 dB in them, with a standard error of 0.3, and lost 1.2 dB in full runs.
+    """
+    model: Any = config.model
+    last = model.motion_start_step(config.train.steps) - 1
+    seconds = 60 * (config.train.minutes or math.inf) * STATIC_CHECK_FRACTION
+    done = 0
+
+    def on_step() -> None:
+        nonlocal done
+        done += 1
+        on_progress("search for motion, steps", done, last)
+
+    capture = add_initial_points(capture, config, log_messages=False, on_progress=on_progress)
+    deadline = time.monotonic() + seconds
+    trainer = _trained(config, capture, frozenset(), deadline, on_step, last=last)
+    if trainer is None:
+        return True
+    training: Any = trainer.model.training
+    return bool(training.finds_motion(trainer.model.scene))
 
 
 def _motion(
@@ -328,15 +358,17 @@ def _trained(
     held_out: frozenset[int],
     deadline: float,
     on_step: Callable[[], None],
+    last: int | None = None,
 ) -> GaussianTrainer | None:
-    """Return the trainer of a pilot run; None where that takes until ``deadline``.
+    """Return the trainer of a pilot run after step ``last``; None where that takes until
+    ``deadline``.
 
-    Its last step is left out: in it, a model at rest would begin to move.
+    By default the last step is left out: in it, a model at rest would begin to move.
     """
     trainer = build_trainer(
         config, capture, held_out=held_out, first=load_initial_gaussians(config, capture)
     )
-    last = config.train.steps - 1
+    last = config.train.steps - 1 if last is None else last
     with Interrupts() as interrupts:
         while trainer.done < last and time.monotonic() < deadline:
             if interrupts.requested:

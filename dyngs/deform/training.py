@@ -225,6 +225,11 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         scene = self._add_windows(scene, step)
         return self._freeze_static(scene) if step in self.schedule.freeze_steps else scene
 
+    def finds_motion(self, scene: DynamicScene) -> bool:
+        """Return whether the static ``scene`` leaves errors that motion may explain."""
+        now = scene.gaussians
+        return self._has_motion(self.capture.static_errors(lambda _: now))
+
     def edit_scene(self, scene: DynamicScene, step: int) -> tuple[DynamicScene, EditResult] | None:
         """Add the Gaussians that motion starts with; None if a static model explains all images."""
         if step != self.schedule.coarse_end:
@@ -232,13 +237,11 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         now = scene.gaussians
         errors = self.capture.static_errors(lambda _: now)
         floor = self.options.motion_threshold
-        has_errors = bool(
-            (errors.peak > SURELY_MOVING * floor).float().mean() > MIN_MOVING_FRACTION
-        )
         threshold = min(max(otsu_threshold(errors.typical), floor), SURELY_MOVING * floor)
         rows = torch.nonzero(errors.typical > threshold)[:, 0]
         first = self._find_initial_motion(now.detach())
-        if self.options.select_moving and not has_errors and not first.timed_gaussians:
+        has_motion = self._has_motion(errors) or bool(first.timed_gaussians)
+        if self.options.select_moving and not has_motion:
             return None
         bodies = self._find_bodies(now.detach())
         added, start = self._build_added(now.detach(), rows, first, bodies)
@@ -275,6 +278,10 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         return replace(
             scene, gaussians=gaussians, field=field, moving=moving, filter_std=std
         ), result
+
+    def _has_motion(self, errors: StaticErrors) -> bool:
+        is_wrong = errors.peak > SURELY_MOVING * self.options.motion_threshold
+        return bool(is_wrong.float().mean() > MIN_MOVING_FRACTION)
 
     def restore(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> DynamicScene:
         self._set_time_window("all_times" in tensors)

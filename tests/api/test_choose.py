@@ -150,6 +150,10 @@ def test_only_moving_pixels_decide_about_motion_before_fixed_cameras() -> None:
     assert module.view_psnr(pair, 0, none) == module.view_psnr(pair, 0)
 
 
+def write_still_views(root: Path) -> None:
+    write_static_capture(root, StaticOptions(size=24, num_train=48, num_test=1, samples=1))
+
+
 @pytest.mark.parametrize(("moves", "steps"), [(True, 200), (False, 300)])
 def test_never_worse_than_static(
     moves: bool, steps: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -160,13 +164,23 @@ def test_never_worse_than_static(
     if moves:
         write_rolling_ball(root)
     else:
-        write_static_capture(root, StaticOptions(size=24, num_train=48, num_test=1, samples=1))
+        write_still_views(root)
         keys = ["init.num_random=300", "model.num_random_moving=150", "data.times=order"]
+        monkeypatch.setattr(module, "_finds_motion", lambda *_: True)
     monkeypatch.setattr(module, "MOTION", replace(module.MOTION, steps=steps))
     config = preset(root, "train.steps=20_000", *keys, "colour.kind=sh")
     best, (choice,), _ = resolve_by_pilot_runs(config, read_capture(config.data))
     assert choice.taken is moves, choice
     assert isinstance(best.model, DynamicModel) is moves
+
+
+def test_a_still_scene_that_a_static_model_explains_needs_no_pilot_runs(tmp_path: Path) -> None:
+    write_still_views(tmp_path)
+    keys = ("train.steps=3000", "init.num_random=300", "data.times=order")
+    config = preset(tmp_path, *keys)
+    best, choices, _ = resolve_by_pilot_runs(config, read_capture(config.data))
+    assert not choices
+    assert without_name(best) == without_name(preset(tmp_path, *keys, name="static"))
 
 
 def test_interrupted_pilot_runs_leave_nothing_and_repeat(
@@ -205,6 +219,7 @@ def test_a_colour_network_is_used_if_it_gains(
         return Choice(text, 8, 20.0, gains[text], 0.1, 1000, 1.0, gains[text] > 0.05)
 
     monkeypatch.setattr(module, "_compared", compare)
+    monkeypatch.setattr(module, "_finds_motion", lambda *_: True)
     config = preset(tmp_path, "train.steps=200_000", "init.num_random=40", "data.longest_side=8")
     best, choices, _ = resolve_by_pilot_runs(config, read_capture(config.data))
     assert [choice.setting for choice in choices] == list(gains)
