@@ -136,6 +136,10 @@ def _further_rows(report: EvalReport) -> list[tuple[str, str]]:
         lowest = min(report.psnr_per_time, key=lambda at: at.psnr)
         spread = f"{lowest.psnr:.2f} (time {lowest.time:g}) to {max(values):.2f} dB"
         rows.append((f"PSNR at {format_count(len(values), 'time')}", spread))
+        rows.append(("first, last of these times", f"{values[0]:.2f}, {values[-1]:.2f} dB"))
+    if report.flicker_static is not None and report.flicker_static_images is not None:
+        images = f"{report.flicker_static:.4f} (images {report.flicker_static_images:.4f})"
+        rows.append(("flicker of static pixels", images))
     if report.num_moving:
         rows.append(("deformation field", f"{report.field_mb:.1f} MB"))
         rows.append(("time for deforming", f"{report.deform_fraction:.0%} of rendering"))

@@ -181,6 +181,9 @@ class EvalReport:
     psnr_static: float | None = None
     ssim_moving: float | None = None
     flip_moving: float | None = None
+    # Standard deviation over time of static pixels of fixed cameras, in [0, 1]; None without
+    flicker_static: float | None = None
+    flicker_static_images: float | None = None
     moving_from: str | None = None  # source of the moving region, None if unknown
     psnr_right: float | None = None
     psnr_right_fitted: float | None = None
@@ -310,6 +313,7 @@ def evaluate_run(
         flip_views=sum(score.flip is not None for score in scores),
         stored_mb=_stored_mb(run_dir),
         moving_from=regions.moving_from,
+        **regions.flicker(),
         **means,
         **fitted,
         **_sizes(scene),

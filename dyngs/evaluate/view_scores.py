@@ -27,6 +27,7 @@ from dyngs.core.metrics import Lpips, flip, psnr, ssim
 from dyngs.data.capture import View
 from dyngs.data.images.maps import silhouette_box
 from dyngs.data.loader import Image
+from dyngs.data.times import static_cameras
 from dyngs.evaluate.motion_masks import MotionMasks, erode
 from dyngs.gaussians.colour.network import apply_affine_colour, fit_affine_colour
 from dyngs.human.avatar.scene import as_human_scene
@@ -55,6 +56,15 @@ NO_MOTION_KNOWN = "no motion masks, and too few times to estimate them"
 TOO_SMALL = f"fewer than {FEWEST_PIXELS} pixels in each view"
 
 
+@dataclass(frozen=True)
+class _Frame:
+    """A view of a fixed camera."""
+
+    rendered: Tensor  # (H, W, 3)
+    truth: Tensor  # (H, W, 3)
+    static: Tensor  # (H, W) bool
+
+
 class Regions:
     """Foreground, moving and static regions of the images of one split.
 
@@ -73,6 +83,10 @@ class Regions:
         self._has_times = any(view.time is not None for view in views)
         self._moving_from: set[str] = set()
         self._has_alpha = False
+        self._fixed_camera = {
+            views[i].name: number for number, seen in enumerate(static_cameras(views)) for i in seen
+        }
+        self._frames: defaultdict[int, list[_Frame]] = defaultdict(list)
 
     def scores(
         self, image: Image, rendered: Tensor, truth: Tensor, with_flip: bool = False
@@ -84,6 +98,9 @@ class Regions:
         self._has_alpha |= foreground is not None
         parts = {"psnr_foreground": foreground, "psnr_moving": moves}
         parts["psnr_static"] = None if moves is None else ~moves
+        camera = self._fixed_camera.get(image.name)
+        if camera is not None and moves is not None:
+            self._frames[camera].append(_Frame(rendered.cpu(), truth.cpu(), ~moves.cpu()))
         scores: dict[str, float | None] = dict.fromkeys(REGION_METRICS)
         for metric, part in parts.items():
             weights = _weights(part, foreground, image.mask)
@@ -94,6 +111,23 @@ class Regions:
                 scores["ssim_moving"] = ssim(rendered, truth, weights)
                 scores["flip_moving"] = flip(rendered, truth, weights).value if with_flip else None
         return scores
+
+    def flicker(self) -> dict[str, float]:
+        """Return the mean standard deviations over time of the static pixels of fixed cameras, of
+        renderings and images; empty without such pixels."""
+        rendered: list[Tensor] = []
+        truth: list[Tensor] = []
+        for frames in self._frames.values():
+            static = torch.stack([frame.static for frame in frames]).all(0)
+            if len(frames) > 1 and bool(static.any()):
+                rendered.append(torch.stack([x.rendered for x in frames]).std(0)[static])
+                truth.append(torch.stack([x.truth for x in frames]).std(0)[static])
+        if not rendered:
+            return {}
+        return {
+            "flicker_static": float(torch.cat(rendered).mean()),
+            "flicker_static_images": float(torch.cat(truth).mean()),
+        }
 
     def moving(self, image: Image) -> Tensor | None:
         """Return the moving pixels (H, W) bool, or None if unknown."""

@@ -129,3 +129,18 @@ def test_reasons_say_why_there_is_no_score() -> None:
     scores = nothing.scores(outside, truth, truth)
     assert (scores["psnr_moving"], scores["psnr_static"]) == (None, 100.0)
     assert nothing.reason("psnr_moving") == TOO_SMALL
+
+
+def test_flicker_is_the_deviation_of_static_pixels_over_time() -> None:
+    """Renderings alternate by 0.02 where nothing moves; the images do not change there."""
+    images = images_of_a_walk()
+    regions = regions_of(images)
+    for k, image in enumerate(images):
+        rendered = image.rgb_premultiplied + 0.02 * (k % 2)
+        rendered[9:15, :18] = 0.2 * k  # where the square walks
+        regions.scores(image, rendered, image.rgb_premultiplied)
+    expected = float(np.std([0.0, 0.02, 0.0, 0.02, 0.0], ddof=1))
+    flicker = regions.flicker()
+    assert flicker["flicker_static"] == pytest.approx(expected, abs=1e-6)
+    assert flicker["flicker_static_images"] == pytest.approx(0.0, abs=1e-6)
+    assert regions_of(images[:1]).flicker() == {}

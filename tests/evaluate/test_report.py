@@ -82,7 +82,7 @@ def test_report_of_a_run(tmp_path) -> None:
     )
     over_time = "num_moving moving_fraction field_mb deform_fraction psnr_per_time psnr_person"
     parts = "ssim_person psnr_foreground psnr_moving psnr_static moving_from"
-    parts += " ssim_moving flip_moving"
+    parts += " ssim_moving flip_moving flicker_static flicker_static_images"
     parts += " psnr_right psnr_right_fitted psnr_own_poses own_poses"
     parts += " silhouette_poses psnr_white psnr_black ssim_black lpips_black see_through flip_views"
     rest = {
