@@ -5,15 +5,18 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from dyngs.core.section import SceneModel
-from dyngs.deform.keys import (
-    DynamicModel,
-)
+from dyngs.deform.keys import DynamicModel, FreeField
 from dyngs.models.kind import HasMotion, HasSchedules, HasSizeLimit
 
 if TYPE_CHECKING:
     from dyngs.data.capture import Capture
     from dyngs.models.kind import Restore, Start
     from dyngs.models.schedule import LengthChange
+
+
+FREE_RATE_FACTOR = 2.0
+"""Learning rate factor of free primitives: each one is seen by the views around its time alone.
+Measured (docs/research-log.md): 2 gains on ``rig`` and ``stage``, 3 loses on ``rig``."""
 
 
 class DynamicKind(HasSizeLimit, HasMotion, HasSchedules):
@@ -26,6 +29,9 @@ class DynamicKind(HasSizeLimit, HasMotion, HasSchedules):
             "the images have no times; train configs/static.yaml, add a time to each image "
             "(`dyngs docs captures`), or set data.times=order if the file names are in temporal order"
         )
+
+    def rate_factor(self, section: DynamicModel) -> float:
+        return FREE_RATE_FACTOR if isinstance(section.deform, FreeField) else 1.0
 
     def functions(self) -> tuple[Start, Restore]:
         from dyngs.deform.start import restore, start

@@ -56,19 +56,22 @@ def rate_schedule(config: Config) -> RateSchedule:
 
 
 def rate_factors(config: Config) -> tuple[float, float]:
-    """Return the learning rate factors of means and of all other parameters; 1 in 30,000 steps.
+    """Return the learning rate factors of means and of all other parameters.
 
-    Short runs need larger rates. ``optim.rate_factor`` takes precedence. Otherwise only static
-    scenes use a factor: in moving scenes, faster Gaussians repaint each image instead of following
-    the motion.
+    ``optim.rate_factor`` takes precedence. Otherwise short runs of static scenes need larger rates,
+    and free primitives in runs of any length. With other fields, faster Gaussians repaint each
+    image instead of following the motion.
     """
     requested = config.optim.rate_factor
     short = PUBLISHED_STEPS / max(SHORTEST, min(config.train.steps, PUBLISHED_STEPS))
     if requested is not None:
         return requested, requested
     kind = capability(config.model, HasGaussians)
-    speeds_up = kind is not None and kind.speeds_up_short_runs
-    return (short**MEANS_POWER, short**OTHERS_POWER) if speeds_up else (1.0, 1.0)
+    if kind is None:
+        return 1.0, 1.0
+    factor = kind.rate_factor(config.model)
+    speeds_up = kind.speeds_up_short_runs
+    return (short**MEANS_POWER, short**OTHERS_POWER) if speeds_up else (factor, factor)
 
 
 def learning_rates(config: Config) -> OptimConfig:

@@ -136,6 +136,10 @@ class HasGaussians(ModelKind):
     speeds_up_short_runs: ClassVar[bool] = False
     """Whether shorter runs use higher learning rates, see ``optim.rate_factor``."""
 
+    def rate_factor(self, section: Any) -> float:
+        """Return the factor on the published learning rates in runs of any length."""
+        return 1.0
+
     def with_added_gaussians(self, section: SceneModel, most: int) -> SceneModel:
         """Return the section with at most ``most`` Gaussians added outside of the strategy."""
         return section

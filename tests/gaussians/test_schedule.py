@@ -19,7 +19,7 @@ from dyngs.config import (
     TrainConfig,
 )
 from dyngs.config.io import load_config, packaged_preset
-from dyngs.deform.keys import DynamicModel
+from dyngs.deform.keys import DynamicModel, FreeField
 from dyngs.deform.schedule import deform_schedule
 from dyngs.gaussians.schedule import (
     GROWTH,
@@ -134,6 +134,13 @@ def test_rates_of_a_static_scene_fit_the_length() -> None:
 def test_deformation_rates_are_the_published_ones_at_any_length(model: SceneModel) -> None:
     assert rate_factors(_config(500, model=model)) == (1, 1)
     assert rate_factors(_config(500, OptimConfig(rate_factor=2), model)) == (2, 2)
+
+
+def test_free_primitives_learn_twice_as_fast_at_any_length() -> None:
+    model = DynamicModel(deform=FreeField())
+    assert rate_factors(_config(500, model=model)) == (2, 2)
+    assert rate_factors(_config(90_000, model=model)) == (2, 2)
+    assert rate_factors(_config(500, OptimConfig(rate_factor=1), model)) == (1, 1)
 
 
 def test_means_rate_is_log_linear_times_the_extent() -> None:
