@@ -11,6 +11,7 @@ from torch import Tensor
 
 from dyngs.config import Config
 from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, View, all_views
 from dyngs.data.images.lens import undistort_points
 from dyngs.data.loader import Image
@@ -92,7 +93,13 @@ def load_priors(
         }
     tracks = None
     if "tracks" in wanted and capture.tracks_path is not None:
-        tracks = _point_tracks(config, read_tracks(capture.tracks_path), views)
+        read = read_tracks(capture.tracks_path)
+        if not read.rows_of(views):
+            raise DyngsError(
+                f"{capture.tracks_path}: 'names' holds no training view, such as "
+                f"{views[0].name!r}; write the file_path of each frame"
+            )
+        tracks = _point_tracks(config, read, views)
     found = {"depth maps": depth, "optical flow": flow_to, "tracks": tracks, "motion masks": masks}
     names = ", ".join(name for name, x in found.items() if x)
     return PriorLosses(depth, flow_to, tracks, masks, names and f"using priors: {names}")

@@ -3,12 +3,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal, cast
 
+import numpy as np
 import pytest
 import torch
 from moving_scene import MOVING_ROWS, SETUP, Sliding, camera, row_of_balls
 from tiny_priors import with_priors
 
 from dyngs.config.io import load_config
+from dyngs.core.errors import DyngsError
 from dyngs.data.loader import Image
 from dyngs.data.read import read_capture
 from dyngs.deform.scene import DynamicScene
@@ -52,6 +54,15 @@ def test_priors_that_are_not_requested_are_not_read(tmp_path: Path) -> None:
 
 def test_still_scenes_use_depth_alone(tmp_path: Path) -> None:
     assert found(with_priors(tmp_path), moves=False).message.endswith(": depth maps")
+
+
+def test_tracks_of_other_images_are_refused(tmp_path: Path) -> None:
+    root = with_priors(tmp_path)
+    arrays = dict(np.load(root / "tracks.npz"))
+    arrays["names"] = np.array([f"other/{i}.png" for i in range(len(arrays["names"]))])
+    np.savez(root / "tracks.npz", **arrays)
+    with pytest.raises(DyngsError, match=r"tracks.npz: 'names' holds no training view, such as"):
+        found(root)
 
 
 def scene(speed: float) -> DynamicScene:
