@@ -82,8 +82,7 @@ MEASUREMENTS = {
         ("data.longest_side=480", "train.steps=10000"), in_readme=True,
     ),
     "rig": Measurement(
-        "moving", "rig: four fixed cameras", "rig", "dynamic",
-        ("train.steps=6000",), in_readme=True,
+        "moving", "rig: four fixed cameras", "rig", "dynamic", in_readme=True
     ),
     "clip_duck": Measurement(
         "moving", "duck: a clip, one moving camera", "clip_duck", "dynamic",

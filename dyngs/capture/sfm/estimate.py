@@ -377,6 +377,8 @@ def _frames_of(
 _AT_ONCE, _MATCHING_CALLS = 8, 16
 # images up to this long are doubled in size for finding features: they have few otherwise
 _SMALL_PX = 1000
+# Longest side in px of video frames: their neighbours overlap, so that fewer features suffice.
+_VIDEO_SIDE = 1080
 _PEAK = 0.02 / 3
 
 
@@ -398,9 +400,9 @@ def find_features(task: SfmTask) -> None:
         reader.mask_path = task.masks
     if task.has_one_lens:
         mode = pycolmap.CameraMode.SINGLE
-    side = min(task.side, LONGEST_SIDE)
+    side = min(task.side, _VIDEO_SIDE if task.is_video else LONGEST_SIDE)
 
-    extraction = feature_options(task.options.num_threads, LONGEST_SIDE, MAX_FEATURES)
+    extraction = feature_options(task.options.num_threads, side, MAX_FEATURES)
     extraction.sift.peak_threshold = _PEAK
     extraction.sift.first_octave = -1 if side <= _SMALL_PX else 0
     pycolmap.Database.open(task.database).close()
@@ -450,10 +452,11 @@ def _enter_focal_lengths(task: SfmTask) -> None:
 
 _EXHAUSTIVE_PHOTOS, _EXHAUSTIVE_FRAMES = 60, 24
 _STEPS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
+_VIDEO_STEPS = (1, 2, 4, 8, 16, 32)
 """Distances in the order of names at which images are compared: dense near, sparse far (loops of a
 few seconds)."""
 # images that look most alike, compared with each one next to its neighbours
-_ALIKE_FRAMES, _ALIKE_PHOTOS = 6, 24
+_ALIKE_FRAMES, _ALIKE_PHOTOS = 4, 24
 _WORDS, _SAMPLE, _ROUNDS = 64, 20_000, 8
 
 
@@ -464,7 +467,8 @@ def pairs_to_match(task: SfmTask) -> list[tuple[int, int]]:
     limit = _EXHAUSTIVE_FRAMES if task.is_video else _EXHAUSTIVE_PHOTOS
     if matching == "exhaustive" or (matching == "auto" and count <= limit):
         return list(combinations(range(count), 2))
-    near = [(i, i + step) for step in _STEPS for i in range(count - step)]
+    steps = _VIDEO_STEPS if task.is_video else _STEPS
+    near = [(i, i + step) for step in steps for i in range(count - step)]
     return near if matching == "sequential" else near + _alike_pairs(task)
 
 
