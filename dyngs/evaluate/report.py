@@ -181,7 +181,8 @@ class EvalReport:
     psnr_static: float | None = None
     ssim_moving: float | None = None
     flip_moving: float | None = None
-    # Standard deviation over time of static pixels of fixed cameras, in [0, 1]; None without
+    # standard deviation over time of the static pixels of fixed cameras, in [0, 1]; None without
+    # such pixels
     flicker_static: float | None = None
     flicker_static_images: float | None = None
     moving_from: str | None = None  # source of the moving region, None if unknown

@@ -56,13 +56,21 @@ NO_MOTION_KNOWN = "no motion masks, and too few times to estimate them"
 TOO_SMALL = f"fewer than {FEWEST_PIXELS} pixels in each view"
 
 
-@dataclass(frozen=True)
-class _Frame:
-    """A view of a fixed camera."""
+@dataclass
+class _OverTime:
+    """Sums over the views of a fixed camera, of rendering and image, (2, H, W, 3) float64."""
 
-    rendered: Tensor  # (H, W, 3)
-    truth: Tensor  # (H, W, 3)
-    static: Tensor  # (H, W) bool
+    count: int
+    sums: Tensor
+    squares: Tensor
+    static: Tensor  # (H, W) bool, static in all views
+
+    def deviations(self) -> Tensor:
+        """Return the standard deviations (2, P, 3) over time of the P static pixels."""
+        sums = self.sums[:, self.static]
+        squares = self.squares[:, self.static]
+        variances = (squares - sums.square() / self.count) / (self.count - 1)
+        return variances.clamp_min(0).sqrt()
 
 
 class Regions:
@@ -86,7 +94,7 @@ class Regions:
         self._fixed_camera = {
             views[i].name: number for number, seen in enumerate(static_cameras(views)) for i in seen
         }
-        self._frames: defaultdict[int, list[_Frame]] = defaultdict(list)
+        self._over_time: dict[int, _OverTime] = {}
 
     def scores(
         self, image: Image, rendered: Tensor, truth: Tensor, with_flip: bool = False
@@ -98,15 +106,14 @@ class Regions:
         self._has_alpha |= foreground is not None
         parts = {"psnr_foreground": foreground, "psnr_moving": moves}
         parts["psnr_static"] = None if moves is None else ~moves
-        camera = self._fixed_camera.get(image.name)
-        if camera is not None and moves is not None:
-            self._frames[camera].append(_Frame(rendered.cpu(), truth.cpu(), ~moves.cpu()))
         scores: dict[str, float | None] = dict.fromkeys(REGION_METRICS)
         for metric, part in parts.items():
             weights = _weights(part, foreground, image.mask)
             if weights is None:
                 continue
             scores[metric] = psnr(rendered, truth, weights)
+            if metric == "psnr_static":
+                self._add_view(image.name, torch.stack([rendered, truth]), weights > 0)
             if metric == "psnr_moving":
                 scores["ssim_moving"] = ssim(rendered, truth, weights)
                 scores["flip_moving"] = flip(rendered, truth, weights).value if with_flip else None
@@ -115,19 +122,27 @@ class Regions:
     def flicker(self) -> dict[str, float]:
         """Return the mean standard deviations over time of the static pixels of fixed cameras, of
         renderings and images; empty without such pixels."""
-        rendered: list[Tensor] = []
-        truth: list[Tensor] = []
-        for frames in self._frames.values():
-            static = torch.stack([frame.static for frame in frames]).all(0)
-            if len(frames) > 1 and bool(static.any()):
-                rendered.append(torch.stack([x.rendered for x in frames]).std(0)[static])
-                truth.append(torch.stack([x.truth for x in frames]).std(0)[static])
-        if not rendered:
+        repeated = [x.deviations() for x in self._over_time.values() if x.count > 1]
+        if not sum(x.shape[1] for x in repeated):
             return {}
-        return {
-            "flicker_static": float(torch.cat(rendered).mean()),
-            "flicker_static_images": float(torch.cat(truth).mean()),
-        }
+        rendered, images = torch.cat(repeated, dim=1).mean((1, 2)).tolist()
+        return {"flicker_static": rendered, "flicker_static_images": images}
+
+    def _add_view(self, name: str, pair: Tensor, static: Tensor) -> None:
+        """Add rendering and image (2, H, W, 3) of a view to the sums of its fixed camera, if it has
+        one."""
+        camera = self._fixed_camera.get(name)
+        if camera is None:
+            return
+        pair = pair.double()
+        before = self._over_time.get(camera)
+        if before is None:
+            self._over_time[camera] = _OverTime(1, pair, pair.square(), static)
+            return
+        before.count += 1
+        before.sums += pair
+        before.squares += pair.square()
+        before.static &= static
 
     def moving(self, image: Image) -> Tensor | None:
         """Return the moving pixels (H, W) bool, or None if unknown."""

@@ -62,16 +62,14 @@ def rate_factors(config: Config) -> tuple[float, float]:
     and free primitives in runs of any length. With other fields, faster Gaussians repaint each
     image instead of following the motion.
     """
-    requested = config.optim.rate_factor
-    short = PUBLISHED_STEPS / max(SHORTEST, min(config.train.steps, PUBLISHED_STEPS))
-    if requested is not None:
-        return requested, requested
+    factor = config.optim.rate_factor
     kind = capability(config.model, HasGaussians)
-    if kind is None:
-        return 1.0, 1.0
-    factor = kind.rate_factor(config.model)
-    speeds_up = kind.speeds_up_short_runs
-    return (short**MEANS_POWER, short**OTHERS_POWER) if speeds_up else (factor, factor)
+    if factor is None and kind is not None:
+        if kind.speeds_up_short_runs:
+            short = PUBLISHED_STEPS / max(SHORTEST, min(config.train.steps, PUBLISHED_STEPS))
+            return short**MEANS_POWER, short**OTHERS_POWER
+        factor = kind.rate_factor(config.model)
+    return (1.0, 1.0) if factor is None else (factor, factor)
 
 
 def learning_rates(config: Config) -> OptimConfig:

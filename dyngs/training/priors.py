@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -15,7 +16,7 @@ from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, View, all_views
 from dyngs.data.images.lens import undistort_points
 from dyngs.data.loader import Image
-from dyngs.data.tracks import ImageTracks, read_tracks
+from dyngs.data.tracks import read_tracks
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.gaussians.scene import GaussianScene
@@ -93,13 +94,7 @@ def load_priors(
         }
     tracks = None
     if "tracks" in wanted and capture.tracks_path is not None:
-        read = read_tracks(capture.tracks_path)
-        if not read.rows_of(views):
-            raise DyngsError(
-                f"{capture.tracks_path}: 'names' holds no training view, such as "
-                f"{views[0].name!r}; write the file_path of each frame"
-            )
-        tracks = _point_tracks(config, read, views)
+        tracks = _point_tracks(config, capture.tracks_path, views)
     found = {"depth maps": depth, "optical flow": flow_to, "tracks": tracks, "motion masks": masks}
     names = ", ".join(name for name, x in found.items() if x)
     return PriorLosses(depth, flow_to, tracks, masks, names and f"using priors: {names}")
@@ -109,10 +104,19 @@ def _timed_camera(view: View, config: Config) -> TimedCamera:
     return TimedCamera(training_cameras([view], config.data)[0], view.time or 0.0)
 
 
-def _point_tracks(config: Config, tracks: ImageTracks, views: Sequence[View]) -> PointTracks:
+def _point_tracks(config: Config, path: Path, views: Sequence[View]) -> PointTracks:
     """Return undistorted tracks in px of training images. Points that cannot be undistorted are not
-    visible."""
+    visible.
+
+    Raises DyngsError if the tracks belong to none of the views.
+    """
+    tracks = read_tracks(path)
     rows = tracks.rows_of(views)
+    if not rows:
+        raise DyngsError(
+            f"{path}: 'names' holds no training view, such as {views[0].name!r}; write the "
+            "file_path of each frame"
+        )
     xy = torch.zeros(len(views), tracks.visible.shape[1], 2, device="cpu")
     visible = torch.zeros(xy.shape[:2], dtype=torch.bool, device="cpu")
     cameras = [_timed_camera(view, config) for view in views]
