@@ -125,8 +125,8 @@ class Regions:
         repeated = [x.deviations() for x in self._over_time.values() if x.count > 1]
         if not sum(x.shape[1] for x in repeated):
             return {}
-        rendered, images = torch.cat(repeated, dim=1).mean((1, 2)).tolist()
-        return {"flicker_static": rendered, "flicker_static_images": images}
+        rendered, images = torch.cat(repeated, dim=1).mean((1, 2))
+        return {"flicker_static": float(rendered), "flicker_static_images": float(images)}
 
     def _add_view(self, name: str, pair: Tensor, static: Tensor) -> None:
         """Add rendering and image (2, H, W, 3) of a view to the sums of its fixed camera, if it has
