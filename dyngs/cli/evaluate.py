@@ -139,7 +139,7 @@ def _further_rows(report: EvalReport) -> list[tuple[str, str]]:
         rows.append(("first, last of these times", f"{values[0]:.2f}, {values[-1]:.2f} dB"))
     if report.flicker_static is not None and report.flicker_static_images is not None:
         flicker = f"{report.flicker_static:.4f} (images {report.flicker_static_images:.4f})"
-        rows.append(("flicker of static pixels", flicker))
+        rows.append(("flicker of what is static", flicker))
     if report.num_moving:
         rows.append(("deformation field", f"{report.field_mb:.1f} MB"))
         rows.append(("time for deforming", f"{report.deform_fraction:.0%} of rendering"))

@@ -181,8 +181,8 @@ class EvalReport:
     psnr_static: float | None = None
     ssim_moving: float | None = None
     flip_moving: float | None = None
-    # standard deviation over time of the static pixels of fixed cameras, in [0, 1]; None without
-    # such pixels
+    # standard deviation over time of static pixels of fixed cameras, or of static sparse points
+    # before others, in [0, 1]; None without these
     flicker_static: float | None = None
     flicker_static_images: float | None = None
     moving_from: str | None = None  # source of the moving region, None if unknown
@@ -268,7 +268,8 @@ def evaluate_run(
         torch.set_num_threads(threads)
     loader = load_split_images(capture, views, run_dir, run)
     loader.device = render_device
-    regions = Regions(views, MotionMasks(capture, run.config.data))
+    points = None if capture.points is None else capture.points.xyz
+    regions = Regions(views, MotionMasks(capture, run.config.data), points)
 
     def images() -> Iterator[Image]:
         for index in range(len(loader)):

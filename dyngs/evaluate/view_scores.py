@@ -58,19 +58,28 @@ TOO_SMALL = f"fewer than {FEWEST_PIXELS} pixels in each view"
 
 @dataclass
 class _OverTime:
-    """Sums over the views of a fixed camera, of rendering and image, (2, H, W, 3) float64."""
+    """Sums over views of the colours of P places, of rendering and image, float64."""
 
-    count: int
-    sums: Tensor
+    sums: Tensor  # (2, P, 3)
     squares: Tensor
-    static: Tensor  # (H, W) bool, static in all views
+    counts: Tensor  # (P,) views that show the place
+    is_static: Tensor  # (P,) bool, in all of these
+
+    def add(self, pair: Tensor, is_shown: Tensor, is_static: Tensor) -> None:
+        """Add the colours (2, P, 3) of a view, where ``is_shown`` (P,)."""
+        pair = pair.double() * is_shown[:, None]
+        self.sums += pair
+        self.squares += pair.square()
+        self.counts += is_shown
+        self.is_static &= is_static | ~is_shown
 
     def deviations(self) -> Tensor:
-        """Return the standard deviations (2, P, 3) over time of the P static pixels."""
-        sums = self.sums[:, self.static]
-        squares = self.squares[:, self.static]
-        variances = (squares - sums.square() / self.count) / (self.count - 1)
-        return variances.clamp_min(0).sqrt()
+        """Return the standard deviations over time (2, P', 3) of the static places of two views or
+        more."""
+        chosen = self.is_static & (self.counts > 1)
+        count = self.counts[chosen, None]
+        variances = self.squares[:, chosen] - self.sums[:, chosen].square() / count
+        return (variances / (count - 1)).clamp_min(0).sqrt()
 
 
 class Regions:
@@ -83,18 +92,26 @@ class Regions:
     Args:
         views: views of the split.
         masks: estimates the moving region. None: unknown without motion masks of the capture.
+        points: sparse points (P, 3) of the capture, by which the flicker of moving cameras is
+            measured.
     """
 
-    def __init__(self, views: Sequence[View], masks: MotionMasks | None = None) -> None:
+    def __init__(
+        self,
+        views: Sequence[View],
+        masks: MotionMasks | None = None,
+        points: np.ndarray | None = None,
+    ) -> None:
         self._views = {view.name: view for view in views}
         self._masks = masks
+        self._points = None if points is None else torch.from_numpy(points)
         self._has_times = any(view.time is not None for view in views)
         self._moving_from: set[str] = set()
         self._has_alpha = False
         self._fixed_camera = {
             views[i].name: number for number, seen in enumerate(static_cameras(views)) for i in seen
         }
-        self._over_time: dict[int, _OverTime] = {}
+        self._over_time: dict[int | None, _OverTime] = {}
 
     def scores(
         self, image: Image, rendered: Tensor, truth: Tensor, with_flip: bool = False
@@ -113,36 +130,40 @@ class Regions:
                 continue
             scores[metric] = psnr(rendered, truth, weights)
             if metric == "psnr_static":
-                self._add_view(image.name, torch.stack([rendered, truth]), weights > 0)
+                self._add_view(image, torch.stack([rendered, truth]), weights > 0)
             if metric == "psnr_moving":
                 scores["ssim_moving"] = ssim(rendered, truth, weights)
                 scores["flip_moving"] = flip(rendered, truth, weights).value if with_flip else None
         return scores
 
     def flicker(self) -> dict[str, float]:
-        """Return the mean standard deviations over time of the static pixels of fixed cameras, of
-        renderings and images; empty without such pixels."""
-        repeated = [x.deviations() for x in self._over_time.values() if x.count > 1]
-        if not sum(x.shape[1] for x in repeated):
+        """Return the mean standard deviations over time of what is static, of renderings and
+        images: pixels of fixed cameras, sparse points before others. Empty without these."""
+        found = torch.cat(
+            [x.deviations() for x in self._over_time.values()] or [torch.zeros(2, 0, 3)], 1
+        )
+        if not found.shape[1]:
             return {}
-        rendered, images = torch.cat(repeated, dim=1).mean((1, 2))
+        rendered, images = found.mean((1, 2))
         return {"flicker_static": float(rendered), "flicker_static_images": float(images)}
 
-    def _add_view(self, name: str, pair: Tensor, static: Tensor) -> None:
-        """Add rendering and image (2, H, W, 3) of a view to the sums of its fixed camera, if it has
-        one."""
-        camera = self._fixed_camera.get(name)
-        if camera is None:
+    def _add_view(self, image: Image, pair: Tensor, is_static: Tensor) -> None:
+        """Add the colours (2, H, W, 3) of rendering and image to the sums over time."""
+        camera = self._fixed_camera.get(image.name)
+        if camera is not None:
+            pair, is_static = pair.flatten(1, 2), is_static.flatten()
+            is_shown = torch.ones_like(is_static)
+        elif self._points is not None:
+            pixels, is_shown = _project(self._points.to(pair.device), image.cameras)
+            pair = pair[:, pixels[:, 1], pixels[:, 0]]
+            is_static = is_static[pixels[:, 1], pixels[:, 0]]
+        else:
             return
-        pair = pair.double()
-        before = self._over_time.get(camera)
-        if before is None:
-            self._over_time[camera] = _OverTime(1, pair, pair.square(), static)
-            return
-        before.count += 1
-        before.sums += pair
-        before.squares += pair.square()
-        before.static &= static
+        if camera not in self._over_time:
+            zeros = torch.zeros_like(pair, dtype=torch.float64)
+            counts = torch.zeros_like(zeros[0, :, 0])
+            self._over_time[camera] = _OverTime(zeros, zeros.clone(), counts, counts == 0)
+        self._over_time[camera].add(pair, is_shown, is_static)
 
     def moving(self, image: Image) -> Tensor | None:
         """Return the moving pixels (H, W) bool, or None if unknown."""
@@ -170,6 +191,17 @@ class Regions:
         if self._moving_from:
             return TOO_SMALL
         return NO_MOTION_KNOWN if self._has_times else NO_TIMES
+
+
+def _project(points: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
+    """Return the pixels (P, 2) across and down of points (P, 3), and whether they are in the image
+    (P,); other pixels are (0, 0)."""
+    pose = cameras.cam_from_world[0].to(points)
+    local = points @ pose[:3, :3].T + pose[:3, 3]
+    pixels = (local / local[:, 2:]) @ cameras.intrinsics[0].to(points).T
+    size = pixels.new_tensor([cameras.width, cameras.height])
+    is_seen = (local[:, 2] > 0) & ((pixels[:, :2] >= 0) & (pixels[:, :2] < size)).all(1)
+    return torch.where(is_seen[:, None], pixels[:, :2], 0).long(), is_seen
 
 
 def _weights(part: Tensor | None, foreground: Tensor | None, mask: Tensor | None) -> Tensor | None:

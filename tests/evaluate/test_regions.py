@@ -144,3 +144,24 @@ def test_flicker_is_the_deviation_of_static_pixels_over_time() -> None:
     assert flicker["flicker_static"] == pytest.approx(expected, abs=1e-6)
     assert flicker["flicker_static_images"] == pytest.approx(0.0, abs=1e-6)
     assert regions_of(images[:1]).flicker() == {}
+
+
+def test_flicker_before_a_moving_camera_is_that_of_static_points() -> None:
+    """A point on the ground, one that the square hides in one view, and one behind the camera."""
+    images = images_of_a_walk()
+    poses = [np.eye(4) for _ in images]
+    for k, pose in enumerate(poses):
+        pose[0, 3] = k
+    views = [
+        View(x.name, Path(x.name), pose, np.eye(3), SIDE, SIDE, time=x.time)
+        for x, pose in zip(images, poses, strict=True)
+    ]
+    points = np.array([[0.0, 2.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, -9.0]])
+    regions = Regions(views, cast(MotionMasks, KnownMasks()), points)
+    for k, image in enumerate(images):
+        rendered = torch.full((SIDE, SIDE, 3), 0.2 * k)
+        rendered[20:] = 0.4 + 0.02 * (k % 2)  # the ground
+        regions.scores(image, rendered, image.rgb_premultiplied)
+    expected = float(np.std([0.0, 0.02, 0.0, 0.02, 0.0], ddof=1))
+    assert regions.flicker()["flicker_static"] == pytest.approx(expected, abs=1e-6)
+    assert regions.flicker()["flicker_static_images"] == pytest.approx(0.0, abs=1e-6)
