@@ -79,7 +79,7 @@ MEASUREMENTS = {
     ),
     "clip_dog": Measurement(
         "moving", "dog: a phone clip of 4 s", "clip_dog/dog.mp4", "dynamic",
-        ("data.longest_side=480", "train.steps=10000"), in_readme=True,
+        ("data.longest_side=480",), in_readme=True,
     ),
     "rig": Measurement(
         "moving", "rig: four fixed cameras", "rig", "dynamic", in_readme=True
@@ -89,8 +89,7 @@ MEASUREMENTS = {
         ("data.longest_side=400",),
     ),
     "stage": Measurement(
-        "moving", "stage (synthetic): eight fixed cameras", "stage", "dynamic",
-        ("train.steps=10000",), in_readme=True,
+        "moving", "stage (synthetic): eight fixed cameras", "stage", "dynamic", in_readme=True
     ),
     "orbits": Measurement(
         "moving", "orbits (synthetic): one view per time", "orbits", "dynamic", in_readme=True

@@ -14,9 +14,8 @@ if TYPE_CHECKING:
     from dyngs.models.schedule import LengthChange
 
 
-FREE_RATE_FACTOR = 2.0
-"""Learning rate factor of free primitives: each one is seen by the views around its time alone.
-Measured (docs/research-log.md): 2 gains on ``rig`` and ``stage``, 3 loses on ``rig``."""
+RATE_FACTOR = 2.0
+"""Learning rate factor of free primitives, and of control nodes in clips (docs/research-log.md)."""
 
 
 class DynamicKind(HasSizeLimit, HasMotion, HasSchedules):
@@ -31,7 +30,7 @@ class DynamicKind(HasSizeLimit, HasMotion, HasSchedules):
         )
 
     def rate_factor(self, section: DynamicModel) -> float:
-        return FREE_RATE_FACTOR if isinstance(section.deform, FreeField) else 1.0
+        return RATE_FACTOR if isinstance(section.deform, FreeField) else 1.0
 
     def functions(self) -> tuple[Start, Restore]:
         from dyngs.deform.start import restore, start

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from dyngs.data.times import evenly_spaced
 from dyngs.deform.bodies.paths import FrameStack, order_moving_camera, render_frame_stack
 from dyngs.deform.fixed_cameras import FixedCameraClip, build_fixed_camera_clip
 from dyngs.deform.keys import ControlNodesField, DynamicModel
-from dyngs.deform.kind import DYNAMIC
+from dyngs.deform.kind import DYNAMIC, RATE_FACTOR
 from dyngs.deform.scene import DynamicScene
 from dyngs.deform.schedule import deform_schedule
 from dyngs.deform.static_errors import (
@@ -58,8 +59,12 @@ def start(run: StartContext) -> GaussianModel:
     if problem is not None:
         raise DyngsError(f"{run.config.data.root}: {problem}")
     if isinstance(model.deform, ControlNodesField):
-        deform = model.deform.resolve_nodes(is_clip(run.capture.splits["train"]))
+        turns_slowly = is_clip(run.capture.splits["train"])
+        deform = model.deform.resolve_nodes(turns_slowly)
         model = model.model_copy(update={"deform": deform})
+        if turns_slowly and run.config.optim.rate_factor is None:
+            optim = run.config.optim.model_copy(update={"rate_factor": RATE_FACTOR})
+            run = replace(run, config=run.config.model_copy(update={"optim": optim}))
     gaussians = load_or_create_gaussians(run)
     colours = build_colour_training(run, gaussians, uses_time=True)
     schedule = deform_schedule(model, rate_schedule(run.config))

@@ -60,7 +60,7 @@ def rate_factors(config: Config) -> tuple[float, float]:
 
     ``optim.rate_factor`` takes precedence. Otherwise short runs of static scenes need larger rates,
     and free primitives in runs of any length. With other fields, faster Gaussians repaint each
-    image instead of following the motion.
+    image instead of following the motion, except in clips, see ``dyngs.deform.start``.
     """
     factor = config.optim.rate_factor
     kind = capability(config.model, HasGaussians)

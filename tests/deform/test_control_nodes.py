@@ -10,17 +10,20 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from moving_scene import write_timed_capture
 from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation
-from tiny_fields import cloud, tiny_setup
+from tiny_fields import busy_config, cloud, tiny_setup
 from torch import Tensor
 
+from dyngs.config import OptimConfig
 from dyngs.core.state import strip_roles
 from dyngs.data.capture import View
 from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.keys import CLIP_NODES, JUMPING_NODES, ControlNodesField
 from dyngs.deform.start import is_clip
 from dyngs.gaussians import TopologyEdit
+from dyngs.training.new_trainer import build_trainer
 
 MEANS_ONLY = {"moves": ()}
 
@@ -214,6 +217,19 @@ def test_several_cameras_are_no_clip() -> None:
     views = turning_views(1.0)
     same_time = [replace(view, time=0.5 * (i % 2)) for i, view in enumerate(views)]
     assert not is_clip(same_time)
+
+
+def test_clips_learn_twice_as_fast(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first step of Adam is as long as the learning rate. A requested factor is kept."""
+    given = busy_config(write_timed_capture(tmp_path), tmp_path, "control_nodes")
+    requested = given.model_copy(update={"optim": OptimConfig(rate_factor=3)})
+    for config, is_a_clip, factor in ((given, True, 2), (given, False, 1), (requested, True, 3)):
+        monkeypatch.setattr("dyngs.deform.start.is_clip", lambda _, found=is_a_clip: found)
+        trainer = build_trainer(config)
+        before = trainer.model.scene.gaussians.logit_opacities.detach().clone()
+        trainer.step()
+        change = (trainer.model.scene.gaussians.logit_opacities.detach() - before).abs().max()
+        assert float(change) == pytest.approx(factor * config.optim.lr_opacities, rel=1e-3)
 
 
 def test_requested_numbers_of_nodes_are_kept() -> None:
