@@ -89,7 +89,8 @@ MEASUREMENTS = {
         ("data.longest_side=400",),
     ),
     "stage": Measurement(
-        "moving", "stage (synthetic): eight fixed cameras", "stage", "dynamic", in_readme=True
+        "moving", "stage (synthetic): eight fixed cameras", "stage", "dynamic",
+        ("train.steps=10000",), in_readme=True,
     ),
     "orbits": Measurement(
         "moving", "orbits (synthetic): one view per time", "orbits", "dynamic", in_readme=True

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from dyngs.core.section import Fraction, Positive, SceneModel, Section
 
@@ -32,21 +32,6 @@ class FieldSection(Section):
         default=("rotations", "scales"),
         description="attributes that change over time besides positions; opacities let objects appear and disappear",
     )
-
-    @model_validator(mode="before")
-    @classmethod
-    def _read_flags(cls, given: Any) -> Any:
-        """Read configs of earlier versions with one flag per attribute (``move_rotations``)."""
-        flags = (
-            {k: given[k] for k in given if k.startswith("move_")} if isinstance(given, dict) else {}
-        )
-        if not flags:
-            return given
-        default = given.get("moves", cls.model_fields["moves"].default)
-        moves = [
-            x for x in get_args(Attribute) if flags.get(f"move_{x}", x in default) in (True, "true")
-        ]
-        return {k: x for k, x in given.items() if k not in flags} | {"moves": moves}
 
 
 class HexplaneField(FieldSection):

@@ -25,6 +25,7 @@ from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
 from dyngs.core.metrics import Lpips, flip, psnr, ssim
 from dyngs.data.capture import View
+from dyngs.data.geometry import project_points
 from dyngs.data.images.maps import silhouette_box
 from dyngs.data.loader import Image
 from dyngs.data.times import static_cameras
@@ -104,7 +105,7 @@ class Regions:
     ) -> None:
         self._views = {view.name: view for view in views}
         self._masks = masks
-        self._points = None if points is None else torch.from_numpy(points)
+        self._points = points
         self._has_times = any(view.time is not None for view in views)
         self._moving_from: set[str] = set()
         self._has_alpha = False
@@ -150,15 +151,19 @@ class Regions:
     def _add_view(self, image: Image, pair: Tensor, is_static: Tensor) -> None:
         """Add the colours (2, H, W, 3) of rendering and image to the sums over time."""
         camera = self._fixed_camera.get(image.name)
-        if camera is not None:
-            pair, is_static = pair.flatten(1, 2), is_static.flatten()
-            is_shown = torch.ones_like(is_static)
-        elif self._points is not None:
-            pixels, is_shown = _project(self._points.to(pair.device), image.cameras)
-            pair = pair[:, pixels[:, 1], pixels[:, 0]]
-            is_static = is_static[pixels[:, 1], pixels[:, 0]]
-        else:
-            return
+        pair = pair.flatten(1, 2)
+        is_static = is_static.flatten()
+        is_shown = torch.ones_like(is_static)
+        if camera is None:
+            if self._points is None:
+                return
+            positions, shown = project_points(self._points, self._views[image.name])
+            across, down = (positions * (image.cameras.width, image.cameras.height)).T
+            pixels = np.where(shown, np.floor(down) * image.cameras.width + np.floor(across), 0)
+            pixel = torch.from_numpy(pixels.astype(np.int64)).to(pair.device)
+            pair = pair[:, pixel]
+            is_static = is_static[pixel]
+            is_shown = torch.from_numpy(shown).to(pair.device)
         if camera not in self._over_time:
             zeros = torch.zeros_like(pair, dtype=torch.float64)
             counts = torch.zeros_like(zeros[0, :, 0])
@@ -191,17 +196,6 @@ class Regions:
         if self._moving_from:
             return TOO_SMALL
         return NO_MOTION_KNOWN if self._has_times else NO_TIMES
-
-
-def _project(points: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
-    """Return the pixels (P, 2) across and down of points (P, 3), and whether they are in the image
-    (P,); other pixels are (0, 0)."""
-    pose = cameras.cam_from_world[0].to(points)
-    local = points @ pose[:3, :3].T + pose[:3, 3]
-    pixels = (local / local[:, 2:]) @ cameras.intrinsics[0].to(points).T
-    size = pixels.new_tensor([cameras.width, cameras.height])
-    is_seen = (local[:, 2] > 0) & ((pixels[:, :2] >= 0) & (pixels[:, :2] < size)).all(1)
-    return torch.where(is_seen[:, None], pixels[:, :2], 0).long(), is_seen
 
 
 def _weights(part: Tensor | None, foreground: Tensor | None, mask: Tensor | None) -> Tensor | None:

@@ -151,9 +151,10 @@ def test_flicker_before_a_moving_camera_is_that_of_static_points() -> None:
     images = images_of_a_walk()
     poses = [np.eye(4) for _ in images]
     for k, pose in enumerate(poses):
-        pose[0, 3] = k
+        pose[:3, 3] = 0.1 * k, 0.0, 4.0
+    intrinsics = camera(SIDE, SIDE).intrinsics[0].double().numpy()
     views = [
-        View(x.name, Path(x.name), pose, np.eye(3), SIDE, SIDE, time=x.time)
+        View(x.name, Path(x.name), pose, intrinsics, SIDE, SIDE, time=x.time)
         for x, pose in zip(images, poses, strict=True)
     ]
     points = np.array([[0.0, 2.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, -9.0]])
