@@ -140,12 +140,10 @@ class Regions:
     def flicker(self) -> dict[str, float]:
         """Return the mean standard deviations over time of what is static, of renderings and
         images: pixels of fixed cameras, sparse points before others. Empty without these."""
-        found = torch.cat(
-            [x.deviations() for x in self._over_time.values()] or [torch.zeros(2, 0, 3)], 1
-        )
-        if not found.shape[1]:
+        found = [x.deviations() for x in self._over_time.values()]
+        if not sum(x.shape[1] for x in found):
             return {}
-        rendered, images = found.mean((1, 2))
+        rendered, images = torch.cat(found, dim=1).mean((1, 2))
         return {"flicker_static": float(rendered), "flicker_static_images": float(images)}
 
     def _add_view(self, image: Image, pair: Tensor, is_static: Tensor) -> None:

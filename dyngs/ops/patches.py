@@ -22,7 +22,6 @@ from dyngs.ops.registration import Backward, check_size, empty_like, launch, reg
 
 NUM_POINTS = 6  # of a quadratic patch
 SEGMENTS = 6  # Of an edge: 36 flat faces (Wu et al. 2025)
-MOST_SEGMENTS = 64
 NO_CROSSING = 0.5  # Between pixels neither of which covers any of the other
 
 

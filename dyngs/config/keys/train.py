@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BeforeValidator, Field, field_validator
+from pydantic import BeforeValidator, Field
 
 from dyngs.core.section import Fraction, Section, parse_digits
 
@@ -117,9 +117,3 @@ class TrainConfig(Section):
         description="programs that show scalars and images of the training; each needs its extra, "
         "such as pip install 'dyngs[wandb]'",
     )
-
-    @field_validator("alpha_weight", mode="before")
-    @classmethod
-    def _read_unset(cls, value: object) -> object:
-        """Replace null, stored by runs of earlier versions, by the default."""
-        return cls.model_fields["alpha_weight"].default if value is None else value
