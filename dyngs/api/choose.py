@@ -1,9 +1,9 @@
-"""Pilot runs: short trainings before a run that decide on motion and on a network for colours.
+"""Pilot runs: short trainings before a run that decide on motion.
 
-Two trainings of the same images, steps and cap on Gaussians differ in one setting. It is taken if
-its mean gain on held-out training views, pair by pair, exceeds twice its standard error; motion
-three times. The simpler side wins a tie, and wherever nothing could be compared. The winner is
-trained in full, on all training views. Settings that the user requested are never compared.
+Two trainings of the same images, steps and cap on Gaussians differ in whether anything moves.
+Motion is taken if its mean gain on held-out training views, pair by pair, exceeds three times its
+standard error. The static scene wins a tie, and wherever nothing could be compared. The winner is
+trained in full, on all training views.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import Any
 import torch
 
 from dyngs.api.first_scene import load_initial_gaussians
-from dyngs.config import BudgetConfig, Config, NetworkColour, PruneConfig, ShColour
+from dyngs.config import BudgetConfig, Config, PruneConfig
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.core.conventions import ProgressCallback, ignore_progress
 from dyngs.core.errors import DyngsError, format_count, log_info
@@ -53,19 +53,17 @@ class _Size:
     Attributes:
         side: longest side of the images, px.
         gaussians: most of them.
-        steps, fewest_steps: most steps, and fewest with which they say something.
+        steps: most steps.
         spent: most of the work of the run that they may take together.
     """
 
     side: int
     gaussians: int
     steps: int
-    fewest_steps: int
     spent: float
 
 
-COLOUR = _Size(side=128, gaussians=15_000, steps=2000, fewest_steps=1000, spent=0.1)
-MOTION = _Size(side=96, gaussians=5000, steps=600, fewest_steps=600, spent=0.25)
+MOTION = _Size(side=96, gaussians=5000, steps=600, spent=0.25)
 """In 300 steps the motion of a turning head is not found yet."""
 MOTION_RANDOM = 1000  # Most random Gaussians that motion begins with in a pilot run
 STATIC_CHECK_FRACTION = 0.08
@@ -79,10 +77,10 @@ FEWEST_VIEWS, FEW_VIEWS, HELD_OUT = 8, 24, 24
 """With fewer views nothing is compared; with fewer than the second, pilot runs are made twice, each
 without a fourth of the views; otherwise about so many are held out."""
 LEAST_GAIN = 0.05  # Mean gain, dB, up to which two settings tie
-ERRORS, ERRORS_OF_MOTION = 2.0, 3.0
+ERRORS = 3.0
 """Standard errors that a gain must exceed. The preset ``static`` learns faster than the static
-model of a pilot run, so motion needs more: on photos of a static cup it gained 1.13 dB (0.56), and
-ended 1.3 dB below ``static``. On captures that move the gain was 3.5 errors or more."""
+model of a pilot run: on photos of a static cup motion gained 1.13 dB (0.56), and ended 1.3 dB below
+``static``. On captures that move the gain was 3.5 errors or more."""
 FILTERED_VIEWS, FREE_VIEWS = 3.0, 3.5
 """Mean number of views per time by fixed cameras from which the 3D filter is used (a room gains 2.1
 dB on other cameras), and from which free primitives replace control nodes: four cameras, some of
@@ -127,7 +125,7 @@ class Choice:
 def resolve_by_pilot_runs(
     config: Config, capture: Capture, on_progress: ProgressCallback = ignore_progress
 ) -> tuple[Config, list[Choice], Capture]:
-    """Resolve motion and colours by pilot runs, where they were not requested.
+    """Resolve motion by pilot runs, where it was not requested.
 
     Returns the resolved config, the results, and the capture with the points that the scene begins
     with.
@@ -142,10 +140,10 @@ def resolve_by_pilot_runs(
         raise DyngsError(f"{config.data.root}: {problem}")
     model: Any = config.model
     if capability(model, HasMotion) is None or not model.pilot_runs:
-        return _with_colour(config, capture, on_progress)
+        return config, [], add_initial_points(capture, config, on_progress=on_progress)
     moves = _motion_of_fixed_cameras(capture, config)
     if moves is False:
-        return _with_colour(as_static(config), capture, on_progress)
+        return _as_static(config, capture, on_progress)
     moving = _with(config, "model", pilot_runs=False)
     views = capture.splits["train"]
     at_once = len(views) / len({view.time for view in views})
@@ -154,15 +152,22 @@ def resolve_by_pilot_runs(
     masks = MotionMasks(capture, config.data) if moves else None
     if moves is None and not _finds_motion(moving, capture, on_progress):
         log_info("nothing moves: a static model explains all images, trained as a static scene")
-        return _with_colour(as_static(config), capture, on_progress)
+        return _as_static(config, capture, on_progress)
     choice = _motion(moving, capture, on_progress, masks)
     if choice is None:
         log_info(f"model.kind=dynamic {_TOO_SHORT}; model.pilot_runs=false trains a moving scene")
-        return _with_colour(as_static(config), capture, on_progress)
+        return _as_static(config, capture, on_progress)
     log_info(f"  {choice}")
-    found = moving if choice.taken else as_static(config)
-    best, choices, capture = _with_colour(found, capture, on_progress, moving=choice.taken)
-    return best, [choice, *choices], capture
+    best = moving if choice.taken else as_static(config)
+    return best, [choice], add_initial_points(capture, best, on_progress=on_progress)
+
+
+def _as_static(
+    config: Config, capture: Capture, on_progress: ProgressCallback
+) -> tuple[Config, list[Choice], Capture]:
+    """Return the config of a static scene, no results, and the prepared capture."""
+    static = as_static(config)
+    return static, [], add_initial_points(capture, static, on_progress=on_progress)
 
 
 def write_choices(folder: Path, choices: Sequence[Choice]) -> None:
@@ -253,7 +258,7 @@ def _motion(
     """
     views = capture.splits["train"]
     folds = _held_out(views)
-    small = _small(config, MOTION, MOTION.steps, math.inf)
+    small = _small(config)
     small = _with(small, "init", num_random=min(config.init.num_random, MOTION.gaussians))
     made_of = capability(config.model, HasGaussians)
     assert made_of is not None
@@ -277,39 +282,13 @@ def _motion(
         capture,
         folds,
         on_progress,
-        errors=ERRORS_OF_MOTION,
-        masks=masks,
-        deadline=begun + MOTION.spent * given,
+        masks,
+        begun + MOTION.spent * given,
     )
     seconds = max(time.monotonic() - begun, 1e-6)
     if (given - seconds) / seconds * work / step < FEWEST_MOVING:
         return None
     return choice
-
-
-def _with_colour(
-    config: Config, capture: Capture, on_progress: ProgressCallback, *, moving: bool = False
-) -> tuple[Config, list[Choice], Capture]:
-    """Return config, results and the prepared capture; if motion improved the held-out views, pilot
-    runs decide about a colour network."""
-    capture = add_initial_points(capture, config, on_progress=on_progress)
-    if not moving or config.colour != ShColour() or config.colour.model_fields_set:
-        return config, [], capture
-    setting = "colour.kind=network"
-    views = capture.splits["train"]
-    folds = _held_out(views)
-    steps, first_side = _affordable(config, views[0], len(folds))
-    if not folds or steps < COLOUR.fewest_steps:
-        log_info(f"{setting} {_TOO_SHORT}")
-        return config, [], capture
-    log_info(f"pilot runs of {format_count(steps, 'step')}, compared on held-out training views:")
-    changed = config.model_copy(update={"colour": NetworkColour()})
-    both = [_small(x, COLOUR, steps, first_side) for x in (config, changed)]
-    choice = _compared(setting, both, capture, folds, on_progress)
-    if choice is None:
-        return config, [], capture
-    log_info(f"  {choice}")
-    return changed if choice.taken else config, [choice], capture
 
 
 def _compared(
@@ -318,10 +297,8 @@ def _compared(
     capture: Capture,
     folds: Sequence[frozenset[int]],
     on_progress: ProgressCallback,
-    *,
-    errors: float = ERRORS,
-    masks: MotionMasks | None = None,
-    deadline: float = math.inf,
+    masks: MotionMasks | None,
+    deadline: float,
 ) -> Choice | None:
     """Train both configs without each fold of the training views, and compare them on it; None
     where that takes until ``deadline``."""
@@ -351,7 +328,7 @@ def _compared(
         error=error,
         steps=both[0].train.steps,
         seconds=time.monotonic() - begun,
-        taken=gain > max(errors * error, LEAST_GAIN),
+        taken=gain > max(ERRORS * error, LEAST_GAIN),
     )
 
 
@@ -384,18 +361,6 @@ def _trained(
     return trainer if trainer.done >= last else None
 
 
-def _affordable(config: Config, view: View, folds: int) -> tuple[int, float]:
-    """Return the steps of each pilot run within its part of the work, 0 where a time is given, and
-    the longest side of the images that the run itself begins with."""
-    first_side = max(view_size(view, config.data)) / config.train.initial_downscale
-    if config.train.minutes is not None:
-        return 0, first_side
-    small = _small(config, COLOUR, 1000, first_side)
-    work = config.train.steps * _work_of_step(config, view) / _work_of_step(small, view)
-    runs = max(2 * folds, 1)
-    return min(COLOUR.steps, int(COLOUR.spent * work / runs)), first_side
-
-
 def _work_of_step(config: Config, view: View) -> float:
     width, height = view_size(view, config.data)
     times = range(0, config.train.steps, max(1, config.train.steps // 50))
@@ -404,26 +369,20 @@ def _work_of_step(config: Config, view: View) -> float:
     return STEP_COST + width * height * drawn + GAUSSIAN_COST * gaussians
 
 
-def _small(config: Config, size: _Size, steps: int, first_side: float) -> Config:
-    """Return ``config`` for ``steps`` in small images, with few Gaussians and without limits.
-
-    They begin with no smaller images than the run itself, ``first_side`` px: in smaller ones motion
-    is lost that it follows.
-    """
-    side = min(config.data.longest_side or size.side, size.side)
-    most = config.train.initial_downscale
-    divisors = (n for n in (16, 8, 4, 2) if n <= most and side / n >= first_side)
+def _small(config: Config) -> Config:
+    """Return ``config`` as a pilot run: in small images, with few Gaussians and without limits."""
+    side = min(config.data.longest_side or MOTION.side, MOTION.side)
     length = {
-        "steps": steps,
+        "steps": MOTION.steps,
         "minutes": None,
         "save_every": 0,
         "eval_every": 0,
-        "initial_downscale": next(divisors, 1),
+        "initial_downscale": 1,
     }
     return config.model_copy(
         update={
             "data": config.data.model_copy(update={"longest_side": side}),
-            "strategy": config.strategy.limited(size.gaussians),
+            "strategy": config.strategy.limited(MOTION.gaussians),
             "train": config.train.model_copy(update=length),
             "budget": BudgetConfig(),
             "prune": PruneConfig(),

@@ -216,8 +216,7 @@ class DynamicModel(SceneModel):
     pilot_runs: bool = Field(
         default=False,
         description="decide by short pilot runs, compared on held-out training views, whether to model motion "
-        "(else the scene is trained as with the preset static) and, if not requested, the colour "
-        "model (`dyngs docs motion`)",
+        "(else the scene is trained as with the preset static; `dyngs docs motion`)",
     )
     motion_from: Fraction = Field(
         default=0.13,

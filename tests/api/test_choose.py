@@ -15,7 +15,7 @@ from PIL import Image
 from two_balls import two_balls
 
 from dyngs.api import choose as module
-from dyngs.api.choose import Choice, as_static, resolve_by_pilot_runs
+from dyngs.api.choose import as_static, resolve_by_pilot_runs
 from dyngs.api.train import train
 from dyngs.config import Config, DataConfig, RunConfig
 from dyngs.config.io import load_config, packaged_preset
@@ -168,7 +168,7 @@ def test_never_worse_than_static(
         keys = ["init.num_random=300", "model.num_random_moving=150", "data.times=order"]
         monkeypatch.setattr(module, "_finds_motion", lambda *_: True)
     monkeypatch.setattr(module, "MOTION", replace(module.MOTION, steps=steps))
-    config = preset(root, "train.steps=20_000", *keys, "colour.kind=sh")
+    config = preset(root, "train.steps=20_000", *keys)
     best, (choice,), _ = resolve_by_pilot_runs(config, read_capture(config.data))
     assert choice.taken is moves, choice
     assert isinstance(best.model, DynamicModel) is moves
@@ -205,25 +205,3 @@ def test_interrupted_pilot_runs_leave_nothing_and_repeat(
     capture = read_capture(config.data)
     first, second = (resolve_by_pilot_runs(config, capture)[1][0] for _ in range(2))
     assert replace(first, seconds=0) == replace(second, seconds=0)
-
-
-@pytest.mark.parametrize("gain", [1.0, 0.01])
-def test_a_colour_network_is_used_if_it_gains(
-    gain: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """It is tried where motion gained, unless the colours were requested."""
-    write_rolling_ball(tmp_path)
-    gains = {"model.kind=dynamic": 1.0, "colour.kind=network": gain}
-
-    def compare(text: str, *_: Any, **__: Any) -> Choice:
-        return Choice(text, 8, 20.0, gains[text], 0.1, 1000, 1.0, gains[text] > 0.05)
-
-    monkeypatch.setattr(module, "_compared", compare)
-    monkeypatch.setattr(module, "_finds_motion", lambda *_: True)
-    config = preset(tmp_path, "train.steps=200_000", "init.num_random=40", "data.longest_side=8")
-    best, choices, _ = resolve_by_pilot_runs(config, read_capture(config.data))
-    assert [choice.setting for choice in choices] == list(gains)
-    assert best.colour.kind == ("network" if gain > 0.05 else "sh")
-    own = preset(tmp_path, "train.steps=200_000", "init.num_random=40", "colour.kind=sh")
-    _, choices, _ = resolve_by_pilot_runs(own, read_capture(own.data))
-    assert [choice.setting for choice in choices] == ["model.kind=dynamic"]
