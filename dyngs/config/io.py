@@ -449,8 +449,7 @@ def _section(
         if key in section.model_fields or not _is_removed(key, x, removed)
     }
     for key in values:
-        was_flag = key.startswith("move_") and "moves" in section.model_fields  # see FieldSection
-        if key not in section.model_fields and not was_flag:
+        if key not in section.model_fields:
             raise DyngsError(_describe_unknown(section, (*above, key), layers))
     for name, info in section.model_fields.items():
         keys = (*above, name)
