@@ -141,8 +141,8 @@ class OptimConfig(Section):
     rate_factor: float | None = Field(
         default=None,
         gt=0,
-        description="factor on all learning rates; null: 1, but 2 for free primitives and clips, and in "
-        "static scenes of 500 to 30,000 steps the square root of 30000 / train.steps for "
+        description="factor on all learning rates; null: 1, but 2 for free primitives and clips, "
+        "and in static scenes of 500 to 30,000 steps the square root of 30000 / train.steps for "
         "positions, its cube root for the others",
     )
     lr_means: Positive = Field(
