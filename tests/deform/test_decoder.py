@@ -19,8 +19,8 @@ SIZES = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacities": 1, "colors"
 @pytest.mark.parametrize("chosen", list(product([False, True], repeat=len(HEADS))))
 def test_heads_by_name(chosen: tuple[bool, ...]) -> None:
     """Outputs are consecutive columns in attribute order; disabled attributes have none."""
-    flags = {f"move_{name}": is_on for name, is_on in zip(HEADS, chosen, strict=True)}
-    options = FieldSection.model_validate(flags)  # as earlier versions wrote it
+    moves = [name for name, is_on in zip(HEADS, chosen, strict=True) if is_on]
+    options = FieldSection.model_validate({"moves": moves})
     is_on = dict(zip(SIZES, (True, *chosen), strict=True))
     sizes = {name: size for name, size in SIZES.items() if is_on[name]}
     assert dict(head_sizes(options)) == sizes
