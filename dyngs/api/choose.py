@@ -53,7 +53,7 @@ class _Size:
     Attributes:
         side: longest side of the images, px.
         gaussians: most of them.
-        steps: most steps.
+        steps: number of steps.
         spent: most of the work of the run that they may take together.
     """
 
@@ -277,7 +277,6 @@ def _motion(
         f"pilot runs of {format_count(MOTION.steps, 'step')}, compared on held-out training views:"
     )
     choice = _compared(
-        "model.kind=dynamic",
         [_with(small, "model", motion_from=1.0), small],
         capture,
         folds,
@@ -292,7 +291,6 @@ def _motion(
 
 
 def _compared(
-    text: str,
     both: Sequence[Config],
     capture: Capture,
     folds: Sequence[frozenset[int]],
@@ -300,8 +298,8 @@ def _compared(
     masks: MotionMasks | None,
     deadline: float,
 ) -> Choice | None:
-    """Train both configs without each fold of the training views, and compare them on it; None
-    where that takes until ``deadline``."""
+    """Train both configs, without and with motion, without each fold of the training views, and
+    compare them on it; None where that takes until ``deadline``."""
     begun = time.monotonic()
     pairs = list[list[float]]()
     steps = both[0].train.steps - 1
@@ -310,7 +308,7 @@ def _compared(
     def on_step() -> None:
         nonlocal done
         done += 1
-        on_progress(f"pilot runs of {text}, steps", done, 2 * len(folds) * steps)
+        on_progress("pilot runs, steps", done, 2 * len(folds) * steps)
 
     for held_out in folds:
         one, other = (_trained(config, capture, held_out, deadline, on_step) for config in both)
@@ -321,7 +319,7 @@ def _compared(
     gain = fmean(gains)
     error = (stdev(gains) if len(gains) > 1 else math.inf) / math.sqrt(len(gains))
     return Choice(
-        setting=text,
+        setting="model.kind=dynamic",
         views=len(pairs),
         without=fmean(before for before, _ in pairs),
         gain=gain,
