@@ -26,6 +26,7 @@ from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.formats.formats import WrittenFile, read_splats
 from dyngs.io.formats.similarity import AXES
 from dyngs.io.formats.splat_file import SplatFile
+from dyngs.io.labelled_sheet import labelled_sheet
 from dyngs.io.write import to_uint8, write_image
 from dyngs.models.renderable import DrawOptions, Renderable, TimeStep
 from dyngs.ops.device import CPU
@@ -269,37 +270,13 @@ def contact_sheet(rows: Sequence[tuple[str, np.ndarray, np.ndarray]]) -> np.ndar
     Args:
         rows: label, truth and render, (H, W, 3) of equal size, uint8 or float in [0, 1].
     """
-    from PIL import Image, ImageDraw
-
-    grey = (32, 32, 32)
     bands = []
     for label, *images in rows:
         truth, rendered = (to_uint8(image) for image in images)
         difference = np.abs(truth.astype(np.float32) - rendered.astype(np.float32)).mean(axis=2)
-        panels = {
-            f"truth  {label}": truth,
-            "render": rendered,
-            "error x5": color_map(5.0 * (difference / 255.0), "magma"),
-        }
-        band = []
-        for text, pixels in panels.items():
-            panel = Image.fromarray(pixels)
-            panel.thumbnail((480, panel.height), Image.Resampling.BOX)
-            cell = Image.new("RGB", (panel.width + 6, panel.height + 22), grey)
-            cell.paste(panel, (0, 22))
-            ImageDraw.Draw(cell).text((2, 5), text, fill=(217, 217, 217))
-            band.append(cell)
-        bands.append(band)
-    width = max(sum(cell.width for cell in band) for band in bands)
-    sheet = Image.new("RGB", (6 + width, sum(band[0].height for band in bands) + 6), grey)
-    top = 0
-    for band in bands:
-        left = 6
-        for cell in band:
-            sheet.paste(cell, (left, top))
-            left += cell.width
-        top += band[0].height
-    return np.asarray(sheet)
+        error = color_map(5.0 * (difference / 255.0), "magma")
+        bands.append([(f"truth  {label}", truth), ("render", rendered), ("error x5", error)])
+    return labelled_sheet(bands)
 
 
 def _depth_limits(depth: np.ndarray, alpha: np.ndarray) -> tuple[float, float]:
