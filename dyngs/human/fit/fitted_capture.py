@@ -27,9 +27,10 @@ from dyngs.config.io import RESOLVED_NAME, load_resolved
 from dyngs.core.conventions import ProgressCallback, ignore_progress
 from dyngs.core.errors import DyngsError, format_count, log_info, wrap_read_errors
 from dyngs.data.body_frames import assign_frame_numbers, frame_number, read_body_file
-from dyngs.data.capture import BodyFrames, Capture, Split, View
+from dyngs.data.capture import BodyFrames, Capture, Split, View, group_by_camera
 from dyngs.data.geometry import to_opengl_pose
 from dyngs.data.images.images import to_straight_uint8
+from dyngs.data.images.maps import silhouette_box
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import is_capture, read_capture
 from dyngs.data.times import evenly_spaced
@@ -47,6 +48,7 @@ from dyngs.human.fit.capture_fit import (
     render_silhouettes,
 )
 from dyngs.human.fit.keypoints import read_joints, read_keypoints
+from dyngs.human.fit.triangulation import triangulate_joints
 from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import CapturedMotion
 from dyngs.io.outputs import atomic_folder, make_once
@@ -119,13 +121,18 @@ def write_fitted_capture(
             capture_body = capture.body["train"]
             known_body = capture_body if has_same_shape_space(body, capture_body) else None
         shaped = apply_known_shape(body, known_body)
+        keypoints = None if inputs.keypoints is None else read_keypoints(inputs.keypoints, views)
+        if inputs.joints is not None:
+            joints = read_joints(inputs.joints, capture)
+        else:
+            joints = triangulate_joints(views, keypoints or {})
         fit = fit_capture(
             capture,
             options,
             shaped,
             on_progress,
-            None if inputs.keypoints is None else read_keypoints(inputs.keypoints, views),
-            joints=None if inputs.joints is None else read_joints(inputs.joints, capture),
+            keypoints,
+            joints=joints,
             one_camera=capture.format == FORMAT,
             shape_known=person is not None,
         )
@@ -140,8 +147,10 @@ def write_fitted_capture(
                 clips[split] = posed.clip
                 by_avatar.append(posed)
         if with_images:
+            windows = crop_windows(capture, options)
             for split in capture.splits:
-                write_split(folder, split, clips.get(split, clips["train"]).rows, capture, options)
+                rows = clips.get(split, clips["train"]).rows
+                write_split(folder, split, rows, capture, options, windows)
             clips = {
                 split: replace(clip, frames=tuple(range(len(clip.frames))))
                 for split, clip in clips.items()
@@ -399,21 +408,81 @@ def _mean_iou(scene: HumanScene, images: ImageLoader) -> float:
     return fmean(ious)
 
 
+CROP_MARGIN = 0.15
+"""Margin around silhouettes in written images, as a fraction of the longest silhouette side."""
+MIN_CROPPED = 0.3  # fraction of an image that cropping must save
+
+
+def crop_windows(capture: Capture, options: DataConfig) -> dict[str, tuple[slice, slice]]:
+    """Return rows and columns around the person by view name, of one size per camera.
+
+    Cameras whose person fills most of the image are not cropped. Views with an empty mask get the
+    window of the view before.
+    """
+    windows: dict[str, tuple[slice, slice]] = {}
+    for views in group_by_camera(capture.splits).values():
+        images = ImageLoader(views, _at_full_size(options))
+        boxes = []
+        for i in range(len(views)):
+            alpha = images[i].alpha
+            boxes.append(None if alpha is None else silhouette_box(alpha, 0.1))
+        found = [box for box in boxes if box is not None]
+        sides = [[part.stop - part.start for part in box] for box in found]
+        if not found or len(set(images.sizes)) > 1:
+            continue
+        margin = 2 * round(CROP_MARGIN * max(map(max, sides)))
+        width, height = images.sizes[0]
+        size = [
+            min(max(side[axis] for side in sides) + margin, whole)
+            for axis, whole in enumerate((height, width))
+        ]
+        if size[0] * size[1] > (1 - MIN_CROPPED) * height * width:
+            continue
+        box = found[0]
+        for view, own in zip(views, boxes, strict=True):
+            box = own or box
+            starts = [
+                min(max((part.start + part.stop - length) // 2, 0), whole - length)
+                for part, length, whole in zip(box, size, (height, width), strict=True)
+            ]
+            windows[view.name] = (
+                slice(starts[0], starts[0] + size[0]),
+                slice(starts[1], starts[1] + size[1]),
+            )
+    return windows
+
+
+def _at_full_size(options: DataConfig) -> DataConfig:
+    return options.model_copy(
+        update={"longest_side": None, "downscale": 1, "body": None, "cache_mb": 0}
+    )
+
+
 def write_split(
-    out: Path, split: Split, rows: Mapping[int, int], capture: Capture, options: DataConfig
+    out: Path,
+    split: Split,
+    rows: Mapping[int, int],
+    capture: Capture,
+    options: DataConfig,
+    windows: Mapping[str, tuple[slice, slice]],
 ) -> None:
     """Write ``transforms_SPLIT.json`` and the undistorted images of a split as PNG with straight
     alpha.
 
-    Separate mask files stay separate (``silhouette_path``). ``rows`` gives the row of the body
-    parameters by frame number.
+    Separate mask files stay separate (``silhouette_path``).
+
+    Args:
+        out: folder of the capture.
+        split: that is written.
+        rows: row of the body parameters by frame number.
+        capture: with the views.
+        options: of reading images.
+        windows: rows and columns to keep, by view name; other images are kept whole.
     """
     views = capture.splits[split]
     if not views:
         return
-    full = options.model_copy(
-        update={"longest_side": None, "downscale": 1, "body": None, "cache_mb": 0}
-    )
+    full = _at_full_size(options)
     images = ImageLoader(views, full)
     photos = ImageLoader([replace(view, silhouette=None) for view in views], full)
     frames: list[dict[str, object]] = []
@@ -422,10 +491,14 @@ def write_split(
         stem = f"{split}/f{row:04d}_c{view.camera_id:02d}_{i:05d}.png"
         image = images[i]
         photo = photos[i]
+        window = windows.get(
+            view.name, (slice(0, image.cameras.height), slice(0, image.cameras.width))
+        )
         parts = [photo.rgb_premultiplied]
         if photo.alpha is not None:
             parts.append(photo.alpha[..., None])
-        write_image(out / f"images/{stem}", to_straight_uint8(torch.cat(parts, dim=-1)).numpy())
+        pixels = to_straight_uint8(torch.cat(parts, dim=-1)[window]).numpy()
+        write_image(out / f"images/{stem}", pixels)
         pose = to_opengl_pose(view.cam_from_world).copy()
         pose[:3, 3] = capture.world_scale * pose[:3, 3] + capture.world_offset
         fl_x, _, cx, _, fl_y, cy = image.cameras.intrinsics[0, :2].double().flatten().tolist()
@@ -433,18 +506,19 @@ def write_split(
             "file_path": f"images/{stem}",
             "frame": row,
             "camera": view.camera_id,
-            "w": image.cameras.width,
-            "h": image.cameras.height,
+            "w": window[1].stop - window[1].start,
+            "h": window[0].stop - window[0].start,
             "fl_x": fl_x,
             "fl_y": fl_y,
-            "cx": cx,
-            "cy": cy,
+            "cx": cx - window[1].start,
+            "cy": cy - window[0].start,
             "transform_matrix": pose.tolist(),
         }
         if view.time is not None:
             frame["time"] = view.time
         if view.silhouette is not None and image.alpha is not None:
-            write_image(out / f"masks/{stem}", to_straight_uint8(image.alpha[..., None]).numpy())
+            alpha = to_straight_uint8(image.alpha[window][..., None]).numpy()
+            write_image(out / f"masks/{stem}", alpha)
             frame["silhouette_path"] = f"masks/{stem}"
         frames.append(frame)
     write_text(out / f"transforms_{split}.json", json.dumps({"frames": frames}, indent=1) + "\n")

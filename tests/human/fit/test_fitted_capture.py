@@ -170,7 +170,7 @@ def test_photos_and_found_masks_are_written_apart(tmp_path: Path) -> None:
     views = capture.splits["train"]
     images = ImageLoader(views)
     rows = {view.frame: row for row, view in enumerate(views) if view.frame is not None}
-    write_split(tmp_path / "out", "train", rows, capture, DataConfig(root=tmp_path))
+    write_split(tmp_path / "out", "train", rows, capture, DataConfig(root=tmp_path), {})
     found, _ = read_views(read_frame_file(tmp_path / "out/transforms_train.json"))
     assert len(found) == len(views)
     for i, view in enumerate(found.values()):
