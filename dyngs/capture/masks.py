@@ -135,7 +135,9 @@ def person_mask(
     return np.isin(labels, 1 + np.flatnonzero(sizes >= LEAST_FRACTION * sizes.max()))
 
 
-def refine_outlines(images: np.ndarray, masks: np.ndarray) -> np.ndarray | None:
+def refine_outlines(
+    images: np.ndarray, masks: np.ndarray, others: np.ndarray | None = None
+) -> np.ndarray | None:
     """Refine the outlines of a detector's masks (F, H, W) by background subtraction; None if the
     camera moves.
 
@@ -146,9 +148,10 @@ def refine_outlines(images: np.ndarray, masks: np.ndarray) -> np.ndarray | None:
     Args:
         images: (F, H, W, 3) uint8, of one camera.
         masks: (F, H, W) bool.
+        others: (F, H, W) bool, where other people are and masks are unchanged; None: nowhere.
     """
     static = np.where(masks[..., None], np.median(images, axis=0).astype(np.uint8), images)
-    if _moves(static):
+    if camera_moves(static):
         return None
     heights = [np.ptp(mask.any(1).nonzero()[0]) + 1 for mask in masks if mask.any()]
     radius = max(2, round(UNSURE * float(np.mean(heights)))) if heights else 2
@@ -167,7 +170,8 @@ def refine_outlines(images: np.ndarray, masks: np.ndarray) -> np.ndarray | None:
     different = np.stack(
         [person_mask(background, x, mask) for x, mask in zip(images, masks, strict=True)]
     )
-    found = np.where(known, (different & reached) | core, masks)
+    is_sure = known if others is None else known & ~others
+    found = np.where(is_sure, (different & reached) | core, masks)
     found = np.stack([_touching(mask, own) for mask, own in zip(found, core, strict=True)])
     common = (found & masks).sum((1, 2))
     either = (found | masks).sum((1, 2))
@@ -180,7 +184,7 @@ def _touching(mask: np.ndarray, core: np.ndarray) -> np.ndarray:
     return np.isin(labels, np.unique(labels[core & mask]))
 
 
-def _moves(images: np.ndarray) -> bool:
+def camera_moves(images: np.ndarray) -> bool:
     """Whether the camera of images (F, H, W, 3) uint8 moves."""
     return (
         camera_displacement(np.stack([small_brightness(image) for image in images]))
@@ -280,7 +284,7 @@ def add_background_masks(
     for camera in _fixed_cameras(capture):
         paths = [view.image_path for view in camera.views]
         sampled = np.stack([camera.image(paths[i]) for i in evenly_spaced(len(paths), SAMPLES)])
-        if _moves(sampled):
+        if camera_moves(sampled):
             raise DyngsError(f"{camera.where}: the camera {_MOVES}")
         background = background_of(sampled)
         masks = np.stack([person_mask(background, image) for image in sampled])
@@ -296,7 +300,7 @@ def add_background_masks(
             name = re.sub(r"[^A-Za-z0-9_-]", "_", view.name)
             target = folder / f"{name}.{len(silhouettes):06d}.png"
             mask = person_mask(background, camera.image(view.image_path))
-            write_image(target, resize_mask(mask, view))
+            write_image(target, resize_mask(mask, view.height, view.width))
             silhouettes[view.name] = Silhouette(target, "white")
     worst = min(found, key=lambda one: one.on_edges)
     log(
@@ -328,10 +332,10 @@ def _fixed_cameras(capture: Capture) -> list[_Camera]:
     return cameras
 
 
-def resize_mask(mask: np.ndarray, view: View) -> np.ndarray:
-    """Return the mask as grey levels (H, W, 1) uint8 at the size of the view's image, bilinear."""
+def resize_mask(mask: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Return the mask as grey levels (height, width, 1) uint8, bilinear."""
     values = torch.from_numpy(mask.astype(np.float32))[None, None]
     sized = torch.nn.functional.interpolate(
-        values, (view.height, view.width), mode="bilinear", align_corners=False
+        values, (height, width), mode="bilinear", align_corners=False
     )
     return (sized[0, 0, :, :, None] * 255).round().to(torch.uint8).numpy()

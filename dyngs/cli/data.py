@@ -127,6 +127,8 @@ def _add_people(verbs: args.Commands) -> None:
     about = "video or image folder of one fixed camera, or a capture with cameras"
     parser.add_argument("clip", type=args.input_path, metavar="CLIP", help=about)
     parser.add_argument("out", type=args.output_path, metavar="OUT", help="a new folder")
+    about = "number of the person, as this command lists them (default: seen largest and longest)"
+    parser.add_argument("--person", type=args.positive_int, metavar="N", help=about)
     about = "Python interpreter of an environment with MediaPipe (default: $DYNGS_MEDIAPIPE)"
     parser.add_argument("--mediapipe", type=args.input_path, metavar="PYTHON", help=about)
     args.add_overrides(parser, "data.key=value", "keys of data")
@@ -333,6 +335,8 @@ def run_people(arguments: argparse.Namespace) -> int:
     from dyngs.human.detect.detector import MediaPipe
 
     options = args.data_section(arguments.overrides).model_copy(update={"root": arguments.clip})
+    if arguments.person is not None:
+        options = options.model_copy(update={"person": arguments.person})
     detector = MediaPipe(arguments.mediapipe)
     with ProgressBar() as report:
         result = write_detected_person(options, arguments.out, detector, report)

@@ -62,6 +62,12 @@ class DataConfig(Section):
         default=None,
         description="time steps to use, as a Python slice start:stop:step; null: all",
     )
+    person: int | None = Field(
+        default=None,
+        ge=1,
+        description="number of the person in a clip of several people, as `dyngs data people` "
+        "lists them; null: the one who is seen largest and longest",
+    )
     pose_frames: str | None = Field(
         default=None,
         description="time steps of a person to hold out as the split pose, as a slice of those "

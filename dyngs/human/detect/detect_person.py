@@ -10,10 +10,11 @@ import json
 import re
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 from scipy import ndimage
 
 from dyngs.capture.fixed_camera import is_image_sequence, read_fixed_camera
@@ -26,6 +27,15 @@ from dyngs.data.capture import Capture, View, group_by_camera
 from dyngs.data.images.images import area_downscale_uint8, read_image, target_size
 from dyngs.data.read import is_capture, read_capture
 from dyngs.human.detect.detector import MIN_CONFIDENCE, Detection, Detector, MediaPipe
+from dyngs.human.detect.pictures import detection_sheet, people_sheet
+from dyngs.human.detect.tracking import (
+    PARAMS,
+    PersonTrack,
+    covered_images,
+    expand_box,
+    find_people,
+    key_point_distance,
+)
 from dyngs.human.fit.capture_fit import viterbi_path
 from dyngs.human.fit.fitted_capture import FitInputs, FittedCapture, write_fitted_capture
 from dyngs.io.outputs import make_once, record_source, require_new_folder
@@ -162,7 +172,20 @@ def _turns(people: Sequence[Detection]) -> bool:
     return bool((across > 0.1).any() and (across < -0.1).any())
 
 
-DETECTOR_SIDE_PX = 960  # longest side of the images given to a detector
+DETECTOR_SIDE_PX = 960
+"""Longest side of the images in which people are searched, and of masks while they are refined."""
+CROP_SIDE_PX = 512
+"""Longest side of the crops around the person in which outlines and key points are detected."""
+MAX_REPROJECTION_ERROR = 0.15
+"""Mean distance, in heights, between epipolar lines and key points of one person in two cameras."""
+
+
+@dataclass(frozen=True)
+class CameraPeople:
+    """People in the images of one camera, the most visible first, in px of the full images."""
+
+    views: tuple[View, ...]
+    tracks: tuple[PersonTrack, ...]
 
 
 def detect_person(
@@ -171,63 +194,291 @@ def detect_person(
     folder: Path,
     on_progress: ProgressCallback,
     log: Callable[[str], None] = log_info,
+    *,
+    person: int | None = None,
 ) -> FitInputs:
-    """Detect the person in all views; write masks and key points to ``folder`` and return their
+    """Detect one person in all views; write masks and key points to ``folder`` and return their
     paths.
 
-    Left and right are made consistent over time. With a fixed camera, masks follow the difference
-    from its background. Views without the person get empty masks. Results and warnings are logged.
-    Raises DyngsError: nobody is detected.
+    Everybody in the images is followed over time. ``person`` numbers them by their size and time in
+    the images, from 1; None: the first. Views in which somebody else is in front of that person
+    are left out. Left and right are made consistent over time. With a fixed camera, masks follow
+    the difference from its background. Views without the person get empty masks. Results and
+    warnings are logged. With several people, ``people.png`` shows them with their numbers. Raises
+    DyngsError: nobody is detected, or no person has that number.
     """
-    points: dict[str, np.ndarray] = {}
-    cameras = [*group_by_camera(capture.splits).values()]
-    for index, views in enumerate(cameras, 1):
-        # Detectors read image files, which are deleted afterwards.
-        size = target_size(views[0].width, views[0].height, 1.0, DETECTOR_SIDE_PX)
-        files = [folder / "frames" / f"{row:06d}.png" for row in range(len(views))]
-        images = np.stack([_shrunk_image(view, size) for view in views])
-        for file, image in zip(files, images, strict=True):
-            write_image(file, image)
-        person, num_swapped = fix_left_right_swaps(detector.detect(files))
-        for file in files:
-            file.unlink()
-        on_progress("detecting the person, cameras", index, len(cameras))
-        prefix = "" if len(cameras) == 1 else f"camera {views[0].camera_id}: "
-        heights = [x.height for x in person if x is not None]
-        if not heights:
-            log(f"warning: {prefix}{detector.name} detects nobody; skipping its images")
-        else:
-            log(
-                f"{prefix}{detector.name} detected the person in {len(heights)} of "
-                f"{format_count(len(person), 'image')}, {np.median(heights):.0f} px high; swapped "
-                f"left and right in {format_count(num_swapped, 'image')}"
-            )
-            for warning in capture_warnings(images, person, is_single_camera=len(cameras) == 1):
-                log(f"warning: {prefix}{warning}")
-        masks = np.zeros(images.shape[:3], bool)
-        for row, detection in enumerate(person):
-            if detection is not None:
-                masks[row] = detection.mask > 127
-                scale = views[row].width / size[0]
-                points[views[row].name] = detection.keypoints * np.array([scale, scale, 1.0])
-        outlines = refine_outlines(images, masks) if heights else None
-        if outlines is not None:
-            iou = (outlines & masks).sum() / max(int((outlines | masks).sum()), 1)
-            log(
-                f"fixed camera: masks refined by background subtraction (IoU with the detector's "
-                f"{iou:.3f})"
-            )
-            masks = outlines
-        for view, mask in zip(views, masks, strict=True):
-            write_image(folder / "masks" / f"{view.name}.png", resize_mask(mask, view))
-    if not points:
+    groups = [*group_by_camera(capture.splits).values()]
+    search = CropDetector(detector, folder / "crops")
+    cameras: list[CameraPeople] = []
+    for index, views in enumerate(groups, 1):
+        cameras.append(_find_people(views, search))
+        on_progress("searching people, cameras", index, len(groups))
+    subjects = choose_subjects(cameras, (person or 1) - 1)
+    if not any(camera.tracks for camera in cameras):
         raise DyngsError(
             f"{capture.root}: {detector.name} detects nobody in "
-            f"{format_count(sum(map(len, cameras)), 'image')}; check the images, or pass masks of "
+            f"{format_count(sum(map(len, groups)), 'image')}; check the images, or pass masks of "
             "another program to `dyngs data fit` (`dyngs docs people`)"
         )
+    if not any(subjects):
+        most = max(len(camera.tracks) for camera in cameras)
+        raise DyngsError(f"{capture.root}: data.person={person}: {detector.name} found only {most}")
+    if any(len(camera.tracks) > 1 for camera in cameras):
+        _describe_people(cameras, subjects, folder / "people.png", log)
+    points: dict[str, np.ndarray] = {}
+    all_masks: list[np.ndarray] = []
+    for index, (camera, subject) in enumerate(zip(cameras, subjects, strict=True), 1):
+        prefix = "" if len(cameras) == 1 else f"camera {camera.views[0].camera_id}: "
+        if subject is None:
+            log(f"warning: {prefix}{detector.name} detects nobody; skipping its images")
+            masks = [np.zeros((view.height, view.width, 1), np.uint8) for view in camera.views]
+        else:
+            masks, own_points = _outline_person(camera, subject, search, prefix, log)
+            points.update(own_points)
+        for view, mask in zip(camera.views, masks, strict=True):
+            write_image(folder / "masks" / f"{view.name}.png", mask)
+        all_masks += masks
+        on_progress("detecting the person, cameras", index, len(cameras))
+    if not points:
+        raise DyngsError(f"{capture.root}: no view shows the person well enough")
+    views = [view for camera in cameras for view in camera.views]
+    pictures = detection_sheet(views, all_masks, [points.get(view.name) for view in views])
+    write_image(folder / "detection.png", pictures)
     _write_keypoints(folder / "keypoints.json", points)
     return FitInputs(keypoints=folder / "keypoints.json", masks=folder / "masks")
+
+
+@dataclass(frozen=True)
+class CropDetector:
+    """A detector that searches windows of images, which it gets as files in ``folder``."""
+
+    detector: Detector
+    folder: Path
+
+    def __call__(
+        self, windows: Sequence[tuple[np.ndarray, np.ndarray]], side: int
+    ) -> list[Detection | None]:
+        """Return the person in each window, with the mask of the window.
+
+        Args:
+            windows: image (H, W, 3) uint8, and box (4,) of whole px in it.
+            side: longest side at which a window is searched, px.
+        """
+        files = [self.folder / f"{row:06d}.png" for row in range(len(windows))]
+        scales = []
+        for file, (image, box) in zip(files, windows, strict=True):
+            left, top, right, bottom = box.astype(int)
+            crop = np.ascontiguousarray(image[top:bottom, left:right])
+            size = target_size(crop.shape[1], crop.shape[0], 1.0, side)
+            write_image(file, area_downscale_uint8(torch.from_numpy(crop), *size).numpy())
+            scales.append(crop.shape[1] / size[0])
+        detections = self.detector.detect(files)
+        for file in files:
+            file.unlink()
+        result: list[Detection | None] = []
+        for detection, (_, box), scale in zip(detections, windows, scales, strict=True):
+            if detection is not None:
+                keypoints = detection.keypoints * np.array([scale, scale, 1.0])
+                keypoints[:, :2] += box[:2]
+                detection = replace(detection, keypoints=keypoints.astype(np.float32))
+            result.append(detection)
+        return result
+
+
+def _find_people(views: Sequence[View], search: CropDetector) -> CameraPeople:
+    size = target_size(views[0].width, views[0].height, 1.0, DETECTOR_SIDE_PX)
+    images = np.stack([_shrunk_image(view, size) for view in views])
+    tracks = find_people(
+        images,
+        lambda windows: search([(images[number], box) for number, box in windows], CROP_SIDE_PX),
+    )
+    scale = views[0].width / size[0]
+    return CameraPeople(tuple(views), tuple(track.scaled(scale) for track in tracks))
+
+
+def choose_subjects(cameras: Sequence[CameraPeople], rank: int) -> list[PersonTrack | None]:
+    """Return the same person in each camera, None where they are not found.
+
+    The camera that sees most people numbers them; ``rank`` counts from 0. In each other camera the
+    track is chosen whose key points agree best with the epipolar geometry.
+    """
+    main = _main_camera(cameras)
+    if rank >= len(main.tracks):
+        return [None for _ in cameras]
+    subject = main.tracks[rank]
+    subjects: list[PersonTrack | None] = []
+    for camera in cameras:
+        if camera is main:
+            subjects.append(subject)
+            continue
+        errors = [_epipolar_error(main, subject, camera, track) for track in camera.tracks]
+        is_other = not errors or min(errors) > MAX_REPROJECTION_ERROR
+        subjects.append(None if is_other else camera.tracks[int(np.argmin(errors))])
+    return subjects
+
+
+def _main_camera(cameras: Sequence[CameraPeople]) -> CameraPeople:
+    return max(cameras, key=lambda x: (len(x.tracks), sum(track.size for track in x.tracks)))
+
+
+def _epipolar_error(
+    first: CameraPeople, person: PersonTrack, second: CameraPeople, other: PersonTrack
+) -> float:
+    """Return the mean distance of key points from epipolar lines, in heights; infinity: the tracks
+    share no time."""
+    times = {view.time: number for number, view in enumerate(second.views)}
+    errors = []
+    for number, detection in person.detections.items():
+        partner = other.detections.get(times.get(first.views[number].time, -1))
+        if partner is None:
+            continue
+        lines = _epipolar_lines(first.views[number], second.views[0], detection.keypoints[:, :2])
+        points = np.concatenate([partner.keypoints[:, :2], np.ones((17, 1))], axis=1)
+        distances = np.abs((lines * points).sum(1)) / np.linalg.norm(lines[:, :2], axis=1)
+        weights = detection.keypoints[:, 2] * partner.keypoints[:, 2]
+        if weights.sum() > 0:
+            errors.append(float((weights * distances).sum() / weights.sum() / partner.height))
+    return float(np.median(errors)) if errors else float("inf")
+
+
+def _epipolar_lines(first: View, second: View, points: np.ndarray) -> np.ndarray:
+    """Return the lines (K, 3) in the second view on which points (K, 2) of the first one lie."""
+    relative = second.cam_from_world @ np.linalg.inv(first.cam_from_world)
+    x, y, z = relative[:3, 3]
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    essential = cross @ relative[:3, :3]
+    inverse = np.linalg.inv(second.intrinsics).T
+    fundamental = inverse @ essential @ np.linalg.inv(first.intrinsics)
+    return np.concatenate([points, np.ones((len(points), 1))], axis=1) @ fundamental.T
+
+
+def _describe_people(
+    cameras: Sequence[CameraPeople],
+    subjects: Sequence[PersonTrack | None],
+    sheet: Path,
+    log: Callable[[str], None],
+) -> None:
+    """Log everybody in the camera that sees most people, and write a picture of them."""
+    main = _main_camera(cameras)
+    for number, track in enumerate(main.tracks, 1):
+        images = track.numbers
+        chosen = " (chosen)" if any(track is subject for subject in subjects) else ""
+        picture = ", never moves: a picture?" if track.is_picture else ""
+        log(
+            f"person {number}{chosen}: images {images[0]} to {images[-1]} of {len(main.views)}, "
+            f"{track.height:.0f} px high{picture}"
+        )
+    log("people.png shows them; choose another one with data.person=NUMBER")
+    write_image(sheet, people_sheet(main.views, main.tracks))
+
+
+def _outline_person(
+    camera: CameraPeople,
+    subject: PersonTrack,
+    search: CropDetector,
+    prefix: str,
+    log: Callable[[str], None],
+) -> tuple[list[np.ndarray], dict[str, np.ndarray]]:
+    """Return masks (H, W, 1) uint8 of all views of a camera, and key points (17, 3) by view name."""
+    views = camera.views
+    shape = (1, views[0].height, views[0].width)
+    others = [track for track in camera.tracks if track is not subject]
+    covered = covered_images(subject, others)
+    numbers = [number for number in subject.numbers if number not in covered]
+    if not numbers:
+        raise DyngsError(f"{prefix}somebody else is in front of the person in all images")
+    windows = {n: expand_box(subject.detections[n].box, shape) for n in numbers}
+    edges = np.stack(list(windows.values()))
+    union = np.concatenate([edges[:, :2].min(0), edges[:, 2:].max(0)])
+    left, top, right, bottom = union.astype(int)
+    size = target_size(right - left, bottom - top, 1.0, DETECTOR_SIDE_PX)
+    scale = (right - left) / size[0]
+    images = np.zeros((len(views), size[1], size[0], 3), np.uint8)
+    crops = []
+    for number, view in enumerate(views):
+        pixels = read_image(view.image_path, (view.width, view.height))[..., :3]
+        around = pixels[top:bottom, left:right].contiguous()
+        images[number] = area_downscale_uint8(around, *size).numpy()
+        if number in windows:
+            crops.append((pixels.numpy(), windows[number]))
+    person: list[Detection | None] = [None for _ in views]
+    masks = np.zeros(images.shape[:3], bool)
+    for number, detection in zip(numbers, search(crops, CROP_SIDE_PX), strict=True):
+        tracked = subject.detections[number]
+        if (
+            detection is None
+            or key_point_distance(detection.keypoints, tracked.keypoints)
+            > 2 * PARAMS.same_person * tracked.height
+        ):
+            continue
+        masks[number] = _place_mask(detection.mask, windows[number], union, size)
+        keypoints = (detection.keypoints - [left, top, 0]) / [scale, scale, 1]
+        person[number] = Detection(
+            keypoints.astype(np.float32), (255 * masks[number]).astype(np.uint8)
+        )
+    person, num_swapped = fix_left_right_swaps(person)
+    heights = [scale * x.height for x in person if x is not None]
+    if not heights:
+        return [np.zeros((view.height, view.width, 1), np.uint8) for view in views], {}
+    log(
+        f"{prefix}{search.detector.name} detected the person in {len(heights)} of "
+        f"{format_count(len(person), 'image')}, {np.median(heights):.0f} px high; swapped "
+        f"left and right in {format_count(num_swapped, 'image')}"
+    )
+    if covered:
+        log(
+            f"{prefix}left out {format_count(len(covered), 'image')} in which somebody else is in "
+            f"front, first image {min(covered)}"
+        )
+    is_single = views[0].camera_id == views[-1].camera_id and prefix == ""
+    for warning in capture_warnings(images, person, is_single_camera=is_single):
+        log(f"warning: {prefix}{warning}")
+    their_boxes = np.zeros(masks.shape, bool)
+    for track in others:
+        for number, detection in track.detections.items():
+            box = (detection.box - [left, top, left, top]) / scale
+            x0, y0, x1, y1 = box.clip(0).astype(int)
+            their_boxes[number, y0:y1, x0:x1] = True
+    outlines = refine_outlines(images, masks, their_boxes)
+    if outlines is not None:
+        iou = (outlines & masks).sum() / max(int((outlines | masks).sum()), 1)
+        log(
+            f"{prefix}fixed camera: masks refined by background subtraction (IoU with the "
+            f"detector's {iou:.3f})"
+        )
+        masks = outlines
+    written = []
+    points = {}
+    for number, (view, detection) in enumerate(zip(views, person, strict=True)):
+        written.append(_full_mask(masks[number], union, view))
+        if detection is not None:
+            keypoints = detection.keypoints * np.array([scale, scale, 1.0])
+            points[view.name] = keypoints + np.array([left, top, 0.0])
+    return written, points
+
+
+def _place_mask(
+    mask: np.ndarray, window: np.ndarray, union: np.ndarray, size: tuple[int, int]
+) -> np.ndarray:
+    """Return the mask (h, w) of a window as bool in the region ``union`` of ``size`` px."""
+    scale = (union[2] - union[0]) / size[0]
+    columns = (np.arange(size[0]) + 0.5) * scale + union[0] - window[0]
+    rows = (np.arange(size[1]) + 0.5) * scale + union[1] - window[1]
+    height, width = window[3] - window[1], window[2] - window[0]
+    grid = np.meshgrid(
+        rows * mask.shape[0] / height - 0.5, columns * mask.shape[1] / width - 0.5, indexing="ij"
+    )
+    placed = ndimage.map_coordinates(mask.astype(np.float32), grid, order=1, mode="nearest")
+    inside = ((rows >= 0) & (rows < height))[:, None] & (columns >= 0) & (columns < width)
+    return (placed > 127) & inside
+
+
+def _full_mask(mask: np.ndarray, union: np.ndarray, view: View) -> np.ndarray:
+    """Return the mask of the region ``union`` as grey levels (H, W, 1) uint8 of a whole image."""
+    left, top, right, bottom = union.astype(int)
+    whole = np.zeros((view.height, view.width, 1), np.uint8)
+    whole[top:bottom, left:right] = resize_mask(mask, bottom - top, right - left)
+    return whole
 
 
 def _shrunk_image(view: View, size: tuple[int, int]) -> np.ndarray:
@@ -270,8 +521,11 @@ def write_detected_person(
     folder = temporary_folder_beside(out.with_name(f"{out.name}.found"))
     try:
         capture = read_fixed_camera(options) if clip else read_capture(options)
-        inputs = detect_person(capture, detector, folder, on_progress, log)
-        return write_fitted_capture(options, out, on_progress, inputs)
+        inputs = detect_person(capture, detector, folder, on_progress, log, person=options.person)
+        result = write_fitted_capture(options, out, on_progress, inputs)
+        for picture in folder.glob("*.png"):
+            shutil.copy(picture, out / picture.name)
+        return result
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
@@ -288,7 +542,8 @@ def ensure_detected_person(
     Raises DyngsError: there is no detector, or see ``write_detected_person``.
     """
     name = re.sub(r"[^A-Za-z0-9-]", "_", data.root.stem)[:40]
-    frames_hash = hashlib.sha256(repr(data.frames).encode()).hexdigest()[:8]
+    chosen = data.frames if data.person is None else (data.frames, data.person)
+    frames_hash = hashlib.sha256(repr(chosen).encode()).hexdigest()[:8]
     folder = cache_folder("people") / f"{name}.{digest_files(data.root)}{frames_hash}"
 
     def detect() -> None:
@@ -298,4 +553,4 @@ def ensure_detected_person(
 
     make_once(folder, detect, log, f"person:  using the cached result in {folder}")
     record_source(folder, data.root)
-    return data.model_copy(update={"root": folder, "frames": None})
+    return data.model_copy(update={"root": folder, "frames": None, "person": None})

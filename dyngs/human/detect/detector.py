@@ -67,8 +67,8 @@ class Detector(Protocol):
     def detect(self, images: Sequence[Path]) -> list[Detection | None]:
         """Return the person in each image, None where nobody is detected.
 
-        ``images`` are PNG files of one size from one camera, in order of time. Raises DyngsError:
-        the detector cannot be started or fails.
+        ``images`` are PNG files of any sizes, the only ones of their folder; each is searched on
+        its own. Raises DyngsError: the detector cannot be started or fails.
         """
         ...
 
@@ -109,7 +109,6 @@ class MediaPipe:
         self._python = chosen
 
     def detect(self, images: Sequence[Path]) -> list[Detection | None]:
-        """Return the person in each image; the folder of the images must not contain others."""
         if not images:
             return []
         with tempfile.TemporaryDirectory(prefix="dyngs-mediapipe-") as out:

@@ -2,7 +2,7 @@
 
     PYTHON -I mediapipe_worker.py IMAGES OUT
 
-IMAGES is a folder of PNG files in order of time. For each image with a person, ``NAME.npz`` is
+IMAGES is a folder of PNG files. For each image with a person, ``NAME.npz`` is
 written to the folder OUT with ``landmarks`` (33, 3): column, row (px) and visibility; and ``mask``
 (H, W) uint8.
 """
@@ -25,7 +25,9 @@ def main() -> int:
     except (ImportError, AttributeError) as error:
         print(error, file=sys.stderr)
         return NO_MEDIAPIPE
-    with solutions.pose.Pose(model_complexity=1, enable_segmentation=True) as pose:
+    with solutions.pose.Pose(
+        static_image_mode=True, model_complexity=1, enable_segmentation=True
+    ) as pose:
         for path in sorted(images.glob("*.png")):
             rgb = np.ascontiguousarray(cv2.imread(str(path))[..., ::-1])
             result = pose.process(rgb)
