@@ -128,7 +128,9 @@ def _add_people(verbs: args.Commands) -> None:
     parser.add_argument("clip", type=args.input_path, metavar="CLIP", help=about)
     parser.add_argument("out", type=args.output_path, metavar="OUT", help="a new folder")
     about = "number of the person, as this command lists them (default: seen largest and longest)"
-    parser.add_argument("--person", type=args.positive_int, metavar="N", help=about)
+    parser.add_argument(
+        "--person", type=args.integer_type("a person", 1, 1000), metavar="N", help=about
+    )
     about = "Python interpreter of an environment with MediaPipe (default: $DYNGS_MEDIAPIPE)"
     parser.add_argument("--mediapipe", type=args.input_path, metavar="PYTHON", help=about)
     args.add_overrides(parser, "data.key=value", "keys of data")

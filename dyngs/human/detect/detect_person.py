@@ -36,8 +36,8 @@ from dyngs.human.detect.tracking import (
     find_people,
     key_point_distance,
 )
-from dyngs.human.fit.capture_fit import viterbi_path
 from dyngs.human.fit.fitted_capture import FitInputs, FittedCapture, write_fitted_capture
+from dyngs.human.fit.viterbi import viterbi_path
 from dyngs.io.outputs import make_once, record_source, require_new_folder
 from dyngs.io.write import cache_folder, temporary_folder_beside, write_image, write_text
 

@@ -45,6 +45,8 @@ from dyngs.human.body.body import NUM_BONE_SHAPES, BodyTemplate
 from dyngs.human.body.joints import JOINT_NAMES, SMPLX_ROWS
 from dyngs.human.body.skinning import axis_angle_to_matrix
 from dyngs.human.fit.keypoints import Joints3D, Keypoints
+from dyngs.human.fit.skeleton_fit import SkeletonModel, SkeletonTargets, fit_skeleton
+from dyngs.human.fit.viterbi import viterbi_path
 from dyngs.human.motion.motion import (
     CapturedMotion,
     MotionClip,
@@ -572,24 +574,6 @@ FramePose = tuple[Tensor, Tensor, float]
 """Pose (J, 3), translation (3,) and error of one frame."""
 
 
-def viterbi_path(costs: np.ndarray, changes: np.ndarray) -> list[int]:
-    """Return the states (T,) with the lowest sum of costs (T, S) and transition costs (T - 1, S,
-    S).
-
-    ``changes[t, a, b]`` is the cost from state a to state b (Viterbi 1967).
-    """
-    total = costs[0]
-    predecessors = []
-    for cost, change in zip(costs[1:], changes, strict=True):
-        candidates = total[:, None] + change
-        predecessors.append(candidates.argmin(0))
-        total = candidates.min(0) + cost
-    path = [int(total.argmin())]
-    for back in reversed(predecessors):
-        path.append(int(back[path[-1]]))
-    return path[::-1]
-
-
 def likely_headings(errors: Sequence[Sequence[float]], weight: float = 0.01) -> list[int]:
     """Return the most likely heading (A,) of each anchor frame from errors (A, H) per heading.
 
@@ -646,6 +630,41 @@ def estimate_initial_poses(
         tracks.append(_track_poses(standing, anchor_poses[0][index], path_roots, body, observed))
         on_progress("body fit, tracking poses", number, len(starts))
     return min(tracks, key=lambda track: track[1])[0]
+
+
+def _poses_from_key_points(
+    times: Tensor,
+    body: BodyDiscs,
+    frames: Mapping[int, ObservedFrame],
+    on_progress: ProgressCallback,
+) -> tuple[MotionClip, Tensor]:
+    """Estimate poses and shape parameters (B,) from the key points and joints of all frames."""
+    first = frames[min(frames)]
+    up = mean_up_direction(first)
+    standing = standing_clip(times, body, up, frames.get)
+    rows = list(SMPLX_ROWS[len(body.skeleton.joints)])
+    indices: list[int] = []
+    projections = []
+    keypoints = []
+    positions = torch.zeros(len(times), len(rows), 4, device="cpu")
+    for row, frame in frames.items():
+        assert frame.joints is not None
+        intrinsics = frame.cameras.intrinsics.clone()
+        intrinsics[:, :2] /= frame.cameras.width
+        projections.append(intrinsics @ frame.cameras.cam_from_world[:, :3])
+        keypoints.append(frame.joints[:, rows])
+        indices += [row] * len(frame.joints)
+        if frame.positions is not None:
+            positions[row] = frame.positions[rows]
+    targets = SkeletonTargets(
+        torch.tensor(indices, device="cpu"),
+        torch.cat(projections),
+        torch.cat(keypoints),
+        positions,
+    )
+    mean, std = usual_pose_statistics(NUM_FITTED_JOINTS)
+    model = SkeletonModel(body.skeleton.joints, body.joint_dirs, body.skeleton.parents, mean, std)
+    return fit_skeleton(standing, up, model, targets, on_progress)
 
 
 def standing_clip(times: Tensor, body: BodyDiscs, up: Tensor, observed: Observations) -> MotionClip:
@@ -918,10 +937,16 @@ def fit_capture(
         candidates = _from_given(body_fit, fit_views, shape, on_progress, effort)
         first_gain = MIN_GAIN if shape_known else MIN_SHAPE_GAIN
     else:
-        clip = estimate_initial_poses(motion.clip.times, discs, fit_views.used.get, on_progress)
+        times = motion.clip.times
+        betas = None
+        if all(frame.joints is not None for frame in fit_views.used.values()):
+            clip, betas = _poses_from_key_points(times, discs, fit_views.used, on_progress)
+        else:
+            clip = estimate_initial_poses(times, discs, fit_views.used.get, on_progress)
         motion = CapturedMotion(clip, motion.frames)
         body_fit = BodyFit(clip, discs, pose_prior(clip, is_given=False))
-        candidates = _from_silhouettes(body_fit, fit_views, shape, on_progress, effort)
+        start = None if shape_known else betas
+        candidates = _from_silhouettes(body_fit, fit_views, shape, start, on_progress, effort)
         first_gain = 0.0
     return CaptureFit(
         motion, _choose_simplest(candidates, first_gain), candidates, fit_views.num_held_out
@@ -991,15 +1016,18 @@ def _from_silhouettes(
     body_fit: BodyFit,
     fit_views: FitViews,
     shape: Sequence[str],
+    betas: Tensor | None,
     on_progress: ProgressCallback,
     effort: FitEffort,
 ) -> tuple[CandidateFit, ...]:
-    """Return candidate fits that start from estimated poses.
+    """Return candidate fits that start from estimated poses, and shape parameters (B,) if known.
 
     These are less accurate than given ones: they get three times the steps and higher initial
     rates.
     """
     parameters = body_fit.initial_parameters()
+    if betas is not None:
+        parameters["betas"].data.copy_(betas)
     first = body_fit.evaluate("frame-by-frame poses", parameters, fit_views.evaluated)
     learned = (*shape, "poses", "trans")
     steps = 3 * effort.steps_for(body_fit.clip)
