@@ -9,7 +9,7 @@ import hashlib
 import json
 import re
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -64,6 +64,7 @@ def fix_left_right_swaps(person: Sequence[Detection | None]) -> tuple[list[Detec
     detections = [x for x in person if x is not None]
     points = np.array([x.keypoints for x in detections], np.float64).reshape(-1, 17, 3)
     heights = np.array([x.height for x in detections])
+    positions = [x.positions for x in detections]
     was_swapped = np.zeros(len(points), bool)
     for pairs in _PAIRS.values():
         swapped = _find_swaps(points, np.array(pairs), heights)
@@ -72,12 +73,18 @@ def fix_left_right_swaps(person: Sequence[Detection | None]) -> tuple[list[Detec
                 points[swapped, right],
                 points[swapped, left],
             )
+        swap = np.arange(17)
+        swap[np.array(pairs)] = np.array(pairs)[:, ::-1]
+        positions = [
+            x[swap] if is_swapped and x is not None else x
+            for x, is_swapped in zip(positions, swapped, strict=True)
+        ]
         was_swapped ^= swapped
     result = list(person)
-    for number, detection, keypoints in zip(
-        numbers, detections, points.astype(np.float32), strict=True
+    for number, detection, keypoints, own in zip(
+        numbers, detections, points.astype(np.float32), positions, strict=True
     ):
-        result[number] = replace(detection, keypoints=keypoints)
+        result[number] = replace(detection, keypoints=keypoints, positions=own)
     return result, int(was_swapped.sum())
 
 
@@ -225,7 +232,7 @@ def detect_person(
         raise DyngsError(f"{capture.root}: data.person={person}: {detector.name} found only {most}")
     if any(len(camera.tracks) > 1 for camera in cameras):
         _describe_people(cameras, subjects, folder / "people.png", log)
-    points: dict[str, np.ndarray] = {}
+    found: dict[str, Detection] = {}
     all_masks: list[np.ndarray] = []
     for index, (camera, subject) in enumerate(zip(cameras, subjects, strict=True), 1):
         prefix = "" if len(cameras) == 1 else f"camera {camera.views[0].camera_id}: "
@@ -233,18 +240,18 @@ def detect_person(
             log(f"warning: {prefix}{detector.name} detects nobody; skipping its images")
             masks = [np.zeros((view.height, view.width, 1), np.uint8) for view in camera.views]
         else:
-            masks, own_points = _outline_person(camera, subject, search, prefix, log)
-            points.update(own_points)
+            masks, own = _outline_person(camera, subject, search, prefix, log)
+            found.update(own)
         for view, mask in zip(camera.views, masks, strict=True):
             write_image(folder / "masks" / f"{view.name}.png", mask)
         all_masks += masks
         on_progress("detecting the person, cameras", index, len(cameras))
-    if not points:
+    if not found:
         raise DyngsError(f"{capture.root}: no view shows the person well enough")
     views = [view for camera in cameras for view in camera.views]
-    pictures = detection_sheet(views, all_masks, [points.get(view.name) for view in views])
-    write_image(folder / "detection.png", pictures)
-    _write_keypoints(folder / "keypoints.json", points)
+    keypoints = [found[view.name].keypoints if view.name in found else None for view in views]
+    write_image(folder / "detection.png", detection_sheet(views, all_masks, keypoints))
+    _write_keypoints(folder / "keypoints.json", found)
     return FitInputs(keypoints=folder / "keypoints.json", masks=folder / "masks")
 
 
@@ -378,8 +385,8 @@ def _outline_person(
     search: CropDetector,
     prefix: str,
     log: Callable[[str], None],
-) -> tuple[list[np.ndarray], dict[str, np.ndarray]]:
-    """Return masks (H, W, 1) uint8 of all views of a camera, and key points (17, 3) by view name."""
+) -> tuple[list[np.ndarray], dict[str, Detection]]:
+    """Return masks (H, W, 1) uint8 of all views of a camera, and the detections by view name."""
     views = camera.views
     shape = (1, views[0].height, views[0].width)
     others = [track for track in camera.tracks if track is not subject]
@@ -414,7 +421,9 @@ def _outline_person(
         masks[number] = _place_mask(detection.mask, windows[number], union, size)
         keypoints = (detection.keypoints - [left, top, 0]) / [scale, scale, 1]
         person[number] = Detection(
-            keypoints.astype(np.float32), (255 * masks[number]).astype(np.uint8)
+            keypoints.astype(np.float32),
+            (255 * masks[number]).astype(np.uint8),
+            detection.positions,
         )
     person, num_swapped = fix_left_right_swaps(person)
     heights = [scale * x.height for x in person if x is not None]
@@ -430,8 +439,7 @@ def _outline_person(
             f"{prefix}left out {format_count(len(covered), 'image')} in which somebody else is in "
             f"front, first image {min(covered)}"
         )
-    is_single = views[0].camera_id == views[-1].camera_id and prefix == ""
-    for warning in capture_warnings(images, person, is_single_camera=is_single):
+    for warning in capture_warnings(images, person, is_single_camera=not prefix):
         log(f"warning: {prefix}{warning}")
     their_boxes = np.zeros(masks.shape, bool)
     for track in others:
@@ -448,13 +456,14 @@ def _outline_person(
         )
         masks = outlines
     written = []
-    points = {}
+    found = {}
     for number, (view, detection) in enumerate(zip(views, person, strict=True)):
         written.append(_full_mask(masks[number], union, view))
         if detection is not None:
-            keypoints = detection.keypoints * np.array([scale, scale, 1.0])
-            points[view.name] = keypoints + np.array([left, top, 0.0])
-    return written, points
+            keypoints = detection.keypoints * np.array([scale, scale, 1.0], np.float32)
+            keypoints[:, :2] += [left, top]
+            found[view.name] = replace(detection, keypoints=keypoints)
+    return written, found
 
 
 def _place_mask(
@@ -486,18 +495,21 @@ def _shrunk_image(view: View, size: tuple[int, int]) -> np.ndarray:
     return area_downscale_uint8(pixels, *size).numpy()
 
 
-def _write_keypoints(path: Path, points: dict[str, np.ndarray]) -> None:
-    """Write the key points (17, 3) of each view, by name, as a COCO file."""
-    images = [{"id": row, "file_name": f"{name}.png"} for row, name in enumerate(points)]
-    people = [
-        {
+def _write_keypoints(path: Path, people: Mapping[str, Detection]) -> None:
+    """Write the key points of each view, by name, as a COCO file, with relative positions beside
+    them."""
+    images = [{"id": row, "file_name": f"{name}.png"} for row, name in enumerate(people)]
+    annotations = []
+    for row, person in enumerate(people.values()):
+        annotation: dict[str, object] = {
             "image_id": row,
             "category_id": 1,
-            "keypoints": [round(float(x), 4) for x in keypoints.ravel()],
+            "keypoints": [round(float(x), 4) for x in person.keypoints.ravel()],
         }
-        for row, keypoints in enumerate(points.values())
-    ]
-    write_text(path, json.dumps({"images": images, "annotations": people}) + "\n")
+        if person.positions is not None:
+            annotation["positions"] = [round(float(x), 4) for x in person.positions.ravel()]
+        annotations.append(annotation)
+    write_text(path, json.dumps({"images": images, "annotations": annotations}) + "\n")
 
 
 def write_detected_person(

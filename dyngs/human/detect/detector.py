@@ -31,10 +31,13 @@ class Detection:
     Attributes:
         keypoints: (17, 3) float32 in COCO order: column and row, px, and confidence in [0, 1].
         mask: (H, W) uint8, 255 = the person.
+        positions: (17, 3) float32, estimated positions of the key points relative to the hips, in
+            axes of the camera (x right, y down, z forward), m; None: not estimated.
     """
 
     keypoints: np.ndarray
     mask: np.ndarray
+    positions: np.ndarray | None = None
 
     @cached_property
     def box(self) -> np.ndarray:
@@ -156,5 +159,9 @@ def _last_line(output: str) -> str:
 def _read(path: Path) -> Detection | None:
     if not path.is_file():
         return None
-    arrays = read_arrays(path, lambda _: ("landmarks", "mask"))
-    return Detection(arrays["landmarks"][list(LANDMARKS)].astype(np.float32), arrays["mask"])
+    arrays = read_arrays(path, lambda _: ("landmarks", "positions", "mask"))
+    rows = list(LANDMARKS)
+    keypoints, positions = (
+        arrays[name][rows].astype(np.float32) for name in ("landmarks", "positions")
+    )
+    return Detection(keypoints, arrays["mask"], positions)

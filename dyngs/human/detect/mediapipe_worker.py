@@ -3,8 +3,8 @@
     PYTHON -I mediapipe_worker.py IMAGES OUT
 
 IMAGES is a folder of PNG files. For each image with a person, ``NAME.npz`` is
-written to the folder OUT with ``landmarks`` (33, 3): column, row (px) and visibility; and ``mask``
-(H, W) uint8.
+written to the folder OUT with ``landmarks`` (33, 3): column, row (px) and visibility; ``positions``
+(33, 3): relative to the hips, m, x right, y down, z away from the camera; and ``mask`` (H, W) uint8.
 """
 
 import importlib
@@ -37,9 +37,13 @@ def main() -> int:
             rows = [
                 (x.x * width, x.y * height, x.visibility) for x in result.pose_landmarks.landmark
             ]
+            positions = [(x.x, x.y, x.z) for x in result.pose_world_landmarks.landmark]
             mask = (np.clip(result.segmentation_mask, 0, 1) * 255).round().astype(np.uint8)
             np.savez_compressed(
-                out / f"{path.stem}.npz", landmarks=np.array(rows, np.float32), mask=mask
+                out / f"{path.stem}.npz",
+                landmarks=np.array(rows, np.float32),
+                positions=np.array(positions, np.float32),
+                mask=mask,
             )
     return 0
 

@@ -45,7 +45,12 @@ from dyngs.human.body.body import NUM_BONE_SHAPES, BodyTemplate
 from dyngs.human.body.joints import JOINT_NAMES, SMPLX_ROWS
 from dyngs.human.body.skinning import axis_angle_to_matrix
 from dyngs.human.fit.keypoints import Joints3D, Keypoints
-from dyngs.human.fit.skeleton_fit import SkeletonModel, SkeletonTargets, fit_skeleton
+from dyngs.human.fit.skeleton_fit import (
+    SkeletonModel,
+    SkeletonTargets,
+    fit_skeleton,
+    limb_direction_error,
+)
 from dyngs.human.fit.viterbi import viterbi_path
 from dyngs.human.motion.motion import (
     CapturedMotion,
@@ -146,6 +151,8 @@ class ObservedFrame:
     # (V, 55, 3) column and row, as fractions of S, and confidence of 2D key points
     joints: Tensor | None = None
     positions: Tensor | None = None  # (55, 4) world positions and confidence of 3D joints
+    # (55, 4) joints relative to the hips, m, in world axes, and confidence; only directions count
+    relative: Tensor | None = None
 
     def select_views(self, turn: int, count: int) -> ObservedFrame:
         """Return ``count`` evenly spaced views; V consecutive turns use each view equally often."""
@@ -463,6 +470,12 @@ class BodyFit:
                 error = error + 0.1 * joint_position_error(
                     joints, frame.positions, pose.scale.detach()
                 )
+            if frame.relative is not None:
+                joints = posed_joints(body.skeleton, pose)
+                rows = list(SMPLX_ROWS[len(joints)])
+                error = error + 0.1 * limb_direction_error(
+                    joints[: len(rows)], frame.relative[rows]
+                )
             errors.append(error)
         return torch.stack(errors).mean()
 
@@ -647,6 +660,7 @@ def _poses_from_key_points(
     projections = []
     keypoints = []
     positions = torch.zeros(len(times), len(rows), 4, device="cpu")
+    relative = torch.zeros(len(times), len(rows), 4, device="cpu")
     for row, frame in frames.items():
         assert frame.joints is not None
         intrinsics = frame.cameras.intrinsics.clone()
@@ -656,11 +670,14 @@ def _poses_from_key_points(
         indices += [row] * len(frame.joints)
         if frame.positions is not None:
             positions[row] = frame.positions[rows]
+        if frame.relative is not None:
+            relative[row] = frame.relative[rows]
     targets = SkeletonTargets(
         torch.tensor(indices, device="cpu"),
         torch.cat(projections),
         torch.cat(keypoints),
         positions,
+        relative,
     )
     mean, std = usual_pose_statistics(NUM_FITTED_JOINTS)
     model = SkeletonModel(body.skeleton.joints, body.joint_dirs, body.skeleton.parents, mean, std)
@@ -891,6 +908,7 @@ def fit_capture(
     effort: FitEffort = FitEffort(),
     *,
     joints: Joints3D | None = None,
+    relative_joints: Joints3D | None = None,
     one_camera: bool = False,
     shape_known: bool = False,
 ) -> CaptureFit:
@@ -908,6 +926,7 @@ def fit_capture(
         keypoints: 2D key points, by view.
         effort: computational cost.
         joints: 3D joints, by frame.
+        relative_joints: 3D joints relative to the hips, m, by frame.
         one_camera: keep the size, which a single camera does not determine.
         shape_known: keep the shape of ``body``.
 
@@ -925,7 +944,15 @@ def fit_capture(
         motion = _clip_without_poses(views, body.joints)
     else:
         motion = captured_motion(capture.root, capture.body["train"], views, body.joints)
-    fit_views = crop_views(capture, motion, options, effort, keypoints or {}, joints or {})
+    fit_views = crop_views(
+        capture,
+        motion,
+        options,
+        effort,
+        keypoints or {},
+        joints or {},
+        relative_joints or {},
+    )
     discs = body_discs(body, RESOLUTION)
     shape = list(SHARED_PARAMETERS)
     if one_camera:
@@ -1098,6 +1125,7 @@ def crop_views(
     effort: FitEffort,
     keypoints: Keypoints,
     joints: Joints3D,
+    relative_joints: Joints3D,
 ) -> FitViews:
     """Crop all frames of ``motion`` to squares around the person.
 
@@ -1124,7 +1152,10 @@ def crop_views(
         for view in views
         if view.name in keypoints
     }
-    positions = {row: joints[frame] for frame, row in motion.rows.items() if frame in joints}
+    positions, relative = (
+        {row: given[frame] for frame, row in motion.rows.items() if frame in given}
+        for given in (joints, relative_joints)
+    )
 
     def observed(rows: dict[int, list[int]]) -> dict[int, ObservedFrame]:
         frames = {
@@ -1133,7 +1164,11 @@ def crop_views(
             )
             for row, row_views in rows.items()
         }
-        return {row: frame for row, frame in frames.items() if frame is not None}
+        return {
+            row: replace(frame, relative=relative.get(row))
+            for row, frame in frames.items()
+            if frame is not None
+        }
 
     num_held_out = sum(map(len, held_out.values()))
     frames = observed(used)
@@ -1184,7 +1219,7 @@ def place_new_poses(
         return None
     motion = captured_motion(capture.root, capture.body["pose"], views, body.joints)
     fit_views = crop_views(
-        capture.replace(splits={"train": views}), motion, options, effort, {}, {}
+        capture.replace(splits={"train": views}), motion, options, effort, {}, {}, {}
     )
     body_fit = BodyFit(
         motion.clip, body_discs(body, RESOLUTION), pose_prior(motion.clip, is_given=True)

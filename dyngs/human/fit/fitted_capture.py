@@ -39,6 +39,7 @@ from dyngs.human.avatar.posing import frame_pose
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.body.body import NUM_FITTED_SHAPES, BodyTemplate
 from dyngs.human.body.body_reader import has_same_shape_space, load_template, rest_shape
+from dyngs.human.fit.camera_refinement import refine_cameras
 from dyngs.human.fit.capture_fit import (
     CaptureFit,
     body_discs,
@@ -47,8 +48,13 @@ from dyngs.human.fit.capture_fit import (
     place_new_poses,
     render_silhouettes,
 )
-from dyngs.human.fit.keypoints import read_joints, read_keypoints
-from dyngs.human.fit.triangulation import triangulate_joints
+from dyngs.human.fit.keypoints import (
+    Joints3D,
+    read_joints,
+    read_keypoints,
+    read_relative_joints,
+)
+from dyngs.human.fit.triangulation import orient_relative_joints, triangulate_joints
 from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import CapturedMotion
 from dyngs.io.outputs import atomic_folder, make_once
@@ -122,10 +128,21 @@ def write_fitted_capture(
             known_body = capture_body if has_same_shape_space(body, capture_body) else None
         shaped = apply_known_shape(body, known_body)
         keypoints = None if inputs.keypoints is None else read_keypoints(inputs.keypoints, views)
+        cameras = None
         if inputs.joints is not None:
             joints = read_joints(inputs.joints, capture)
         else:
+            if capture.body is None:
+                cameras = refine_cameras(views, keypoints or {})
+            if cameras is not None:
+                splits = {split: cameras.apply(x) for split, x in capture.splits.items()}
+                capture = capture.replace(splits=splits)
+                views = capture.splits["train"]
             joints = triangulate_joints(views, keypoints or {})
+        relative: Joints3D = {}
+        if inputs.keypoints is not None and keypoints is not None:
+            in_camera = read_relative_joints(inputs.keypoints, views)
+            relative = orient_relative_joints(views, keypoints, in_camera)
         fit = fit_capture(
             capture,
             options,
@@ -133,6 +150,7 @@ def write_fitted_capture(
             on_progress,
             keypoints,
             joints=joints,
+            relative_joints={frame: x for frame, x in relative.items() if frame not in joints},
             one_camera=capture.format == FORMAT,
             shape_known=person is not None,
         )
@@ -187,7 +205,7 @@ def write_fitted_capture(
         f"silhouette IoU on {_evaluation_views(fit.num_held_out)}: {candidates}",
         f"chosen: {chosen.name}; worst frame {fit.motion.frames[worst]} (IoU "
         f"{chosen.per_frame[worst]:.3f}); see {out / 'fit_overlays.png'}",
-        *(x.summary() for x in (new_poses, *by_avatar) if x is not None),
+        *(x.summary() for x in (cameras, new_poses, *by_avatar) if x is not None),
     ]
     return FittedCapture(out, fit, model, "\n".join(lines))
 

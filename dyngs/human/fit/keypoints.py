@@ -59,6 +59,9 @@ JOINTS = {
 Keypoints = dict[str, Tensor]
 """By view name: (55, 3) column, row (undistorted, px of the stored image) and confidence; 0 for
 missing joints."""
+RelativeJoints = dict[str, Tensor]
+"""By view name: (55, 4) estimated position relative to the hips, m, in axes of the camera, and 1;
+0 for missing joints."""
 Joints3D = dict[int, Tensor]
 """By frame number: (55, 4) position in world coordinates and confidence; 0 for missing joints."""
 
@@ -111,6 +114,32 @@ def read_keypoints(path: Path, views: Sequence[View]) -> Keypoints:
             "IMAGE_keypoints.json, or use the image names as file_name in COCO"
         )
     return keypoints
+
+
+def read_relative_joints(path: Path, views: Sequence[View]) -> RelativeJoints:
+    """Read the ``positions`` beside the key points of a COCO file, as `dyngs data people` writes
+    them; empty without.
+
+    Raises DyngsError: not 17 positions of three numbers.
+    """
+    if path.is_dir():
+        return {}
+    named = _by_name(views)
+    relative: RelativeJoints = {}
+    with wrap_read_errors(path, "give a folder of OpenPose files or a COCO file"):
+        fields = read_json_object(path)
+        names = {x["id"]: x["file_name"].rpartition(".")[0] for x in fields["images"]}
+        for person in fields["annotations"]:
+            view = _view_of(named, names[person["image_id"]])
+            if view is None or "positions" not in person:
+                continue
+            points = parse_numbers(f"{path}: positions", person["positions"], (17, 3))
+            joints = torch.zeros(len(JOINT_NAMES), 4, device="cpu")
+            for name, point in zip(_IN_SPACE[17], points, strict=True):
+                if name in JOINTS:
+                    joints[JOINTS[name]] = torch.tensor([*point, 1.0], device="cpu")
+            relative[view.name] = joints
+    return relative
 
 
 def _marked_joints(file: Path, numbers: object, view: View) -> Tensor:

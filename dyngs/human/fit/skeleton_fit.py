@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from dyngs.core.conventions import ProgressCallback
+from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.body.skinning import axis_angle_to_matrix, joint_transforms
 from dyngs.human.fit.viterbi import viterbi_path
 from dyngs.human.motion.motion import MotionClip, compose_rotations
@@ -30,9 +31,11 @@ class SkeletonParams:
     lr_scale: float = 3e-3
     keypoint_std: float = 0.02  # expected error of a key point, as a fraction of the crop's side
     joint_std: float = 0.03  # expected error of a triangulated joint, m
+    direction_std: float = 0.3  # expected error of an estimated limb direction, rad
+    directions: float = 1.0  # weight of limb directions
     prior: float = 0.02  # weight of squared deviations from usual poses, in standard deviations
     limit: float = 0.2  # weight of squared excess over joint limits
-    smoothness: float = 2.0  # weight of squared second differences of joints, per (0.1 m)^2
+    smoothness: float = 0.5  # weight of squared second differences of joints, per (0.1 m)^2
     shape: float = 0.02  # weight of squared shape parameters
     transition: float = 0.1  # m, mean joint motion between frames that costs as much as a unit
 
@@ -48,6 +51,7 @@ class SkeletonTargets:
     projections: Tensor  # (O, 3, 4) from world coordinates to fractions of the crop's side
     keypoints: Tensor  # (O, J', 3) position, as a fraction of the crop's side, and confidence
     positions: Tensor  # (F, J', 4) world positions and confidence of joints
+    relative: Tensor  # (F, J', 4) joints relative to the hips, in world axes, and confidence
 
     def error(self, joints: Tensor, unit: float) -> Tensor:
         """Return the robust error (..., F) of joints (..., F, J, 3) per frame.
@@ -68,7 +72,43 @@ class SkeletonTargets:
         squared = squared / (PARAMS.joint_std * unit) ** 2
         weights = self.positions[..., 3]
         total = total + (weights * ((1 + squared).sqrt() - 1)).sum(-1)
-        return total / (norm + weights.sum(-1)).clamp_min(1.0)
+        total = total / (norm + weights.sum(-1)).clamp_min(1.0)
+        return total + PARAMS.directions * limb_direction_error(joints, self.relative)
+
+
+_LIMBS = (
+    ("hip", "knee"),
+    ("knee", "ankle"),
+    ("shoulder", "elbow"),
+    ("elbow", "wrist"),
+    ("shoulder", "hip"),
+)
+LIMBS = (
+    *(
+        (JOINT_NAMES.index(f"{side}_{start}"), JOINT_NAMES.index(f"{side}_{end}"))
+        for side in ("left", "right")
+        for start, end in _LIMBS
+    ),
+    (JOINT_NAMES.index("left_hip"), JOINT_NAMES.index("right_hip")),
+    (JOINT_NAMES.index("left_shoulder"), JOINT_NAMES.index("right_shoulder")),
+)
+"""Pairs of joints whose directions are compared; the same rows in all bodies."""
+
+
+def limb_direction_error(joints: Tensor, relative: Tensor) -> Tensor:
+    """Return the mean error (...) of the directions of limbs of joints (..., J', 3).
+
+    1 - cos of the angle to the directions in ``relative`` (..., J', 4), in units of
+    ``PARAMS.direction_std``, robust to large angles. Limbs without confidence do not count.
+    """
+    starts, ends = (list(rows) for rows in zip(*LIMBS, strict=True))
+    limbs = torch.nn.functional.normalize(joints[..., ends, :] - joints[..., starts, :], dim=-1)
+    given = relative[..., ends, :3] - relative[..., starts, :3]
+    given = torch.nn.functional.normalize(given, dim=-1)
+    weights = relative[..., starts, 3] * relative[..., ends, 3]
+    squared = 2 * (1 - (limbs * given).sum(-1)).clamp_min(0.0) / PARAMS.direction_std**2
+    errors = weights * ((1 + squared).sqrt() - 1)
+    return errors.sum(-1) / weights.sum(-1).clamp_min(1.0)
 
 
 @dataclass(frozen=True)

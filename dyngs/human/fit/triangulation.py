@@ -10,10 +10,11 @@ from itertools import combinations
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 from dyngs.data.body_frames import frame_number
 from dyngs.data.capture import View
-from dyngs.human.fit.keypoints import Joints3D, Keypoints
+from dyngs.human.fit.keypoints import Joints3D, Keypoints, RelativeJoints
 
 MIN_CONFIDENCE = 0.3  # of a key point that is used
 TOLERANCE = 0.05  # reprojection error of an inlier, in heights of the person in that view
@@ -44,7 +45,7 @@ def triangulate_joints(views: Sequence[View], keypoints: Keypoints) -> Joints3D:
         projections = np.stack(
             [view.intrinsics @ view.cam_from_world[:3].astype(np.float64) for view in group]
         )
-        tolerances = np.array([TOLERANCE * _height(one) for one in points])
+        tolerances = np.array([TOLERANCE * person_height(one) for one in points])
         placed = np.zeros((points.shape[1], 4))
         for joint in np.flatnonzero((points[..., 2] > MIN_CONFIDENCE).sum(0) >= 2):
             placed[joint] = _triangulate(projections, points[:, joint], tolerances)
@@ -53,7 +54,40 @@ def triangulate_joints(views: Sequence[View], keypoints: Keypoints) -> Joints3D:
     return joints
 
 
-def _height(points: np.ndarray) -> float:
+def orient_relative_joints(
+    views: Sequence[View], keypoints: Keypoints, relative: RelativeJoints
+) -> Joints3D:
+    """Return estimated joints (J, 4) relative to the hips in axes of the world, by frame number.
+
+    The axes of an estimate are those of a camera that looks at the person, so that they are turned
+    to the direction of the key points. The most confident view of each frame is used.
+
+    Args:
+        views: with frame numbers.
+        keypoints: undistorted, by view name.
+        relative: in axes of the camera, by view name.
+    """
+    best: dict[int, View] = {}
+    for view in views:
+        if view.name in keypoints and view.name in relative:
+            frame = frame_number(view)
+            other = best.get(frame, view)
+            if keypoints[view.name][:, 2].sum() >= keypoints[other.name][:, 2].sum():
+                best[frame] = view
+    joints: Joints3D = {}
+    for frame, view in best.items():
+        points = keypoints[view.name].double().numpy()
+        middle = np.average(points[:, :2], axis=0, weights=points[:, 2] + 1e-9)
+        ray = np.linalg.solve(view.intrinsics, np.append(middle, 1.0))
+        to_camera = Rotation.align_vectors(ray[None], np.array([[0.0, 0.0, 1.0]]))[0]
+        to_world = view.cam_from_world[:3, :3].T @ to_camera.as_matrix()
+        placed = relative[view.name].clone()
+        placed[:, :3] = placed[:, :3] @ torch.from_numpy(to_world).to(placed).T
+        joints[frame] = placed
+    return joints
+
+
+def person_height(points: np.ndarray) -> float:
     """Return the vertical extent, px, of the confident key points (J, 3) of one view."""
     rows = points[points[:, 2] > MIN_CONFIDENCE, 1]
     return max(float(np.ptp(rows)), 1.0) if len(rows) else 1.0

@@ -25,7 +25,8 @@ FINDS = """
 for number, path in enumerate(sorted(Path(images).glob("*.png"))):
     if number != 1:
         landmarks = np.stack([np.arange(33), np.full(33, number), np.full(33, 0.5)], 1)
-        np.savez(Path(out) / f"{path.stem}.npz", landmarks=landmarks, mask=np.full((4, 6), 200, np.uint8))
+        mask = np.full((4, 6), 200, np.uint8)
+        np.savez(Path(out) / f"{path.stem}.npz", landmarks=landmarks, positions=-landmarks, mask=mask)
 """
 
 
@@ -54,6 +55,7 @@ def test_detections_of_the_process_are_returned(tmp_path: Path, images: list[Pat
     assert third is not None
     np.testing.assert_array_equal(first.keypoints[:, 0], LANDMARKS)
     np.testing.assert_array_equal(third.keypoints[:, 1], 2)
+    np.testing.assert_array_equal(third.positions, -third.keypoints)
     np.testing.assert_array_equal(first.box, [0, 0, 6, 4])
     assert MediaPipe(interpreter(tmp_path, FINDS)).detect([]) == []
 

@@ -120,7 +120,8 @@ def test_the_fit_begins_with_a_given_shape_of_the_template(
     assert torch.equal(found.fit.motion.clip.trans, clip.trans), "of the shaped body"
 
 
-def test_a_fitted_capture_shows_the_same_images(data: DataConfig, tmp_path: Path) -> None:
+def test_a_fitted_capture_shows_the_same_person(data: DataConfig, tmp_path: Path) -> None:
+    """Images are cropped to the person, so that pixels keep their rays."""
     out = write_fitted_capture(data, tmp_path / "fitted", lambda *_: None).root
     before = read_capture(data)
     after = read_capture(DataConfig(root=out))
@@ -130,8 +131,16 @@ def test_a_fitted_capture_shows_the_same_images(data: DataConfig, tmp_path: Path
         for old, new in zip(
             ordered, sorted(after.splits[split], key=lambda view: view.frame or 0), strict=True
         ):
-            assert (old.time, old.width) == (new.time, new.width)
-            assert np.allclose(old.intrinsics, new.intrinsics)
+            assert old.time == new.time
+            assert new.width * new.height <= old.width * old.height
+            left, top = np.round(old.intrinsics[:2, 2] - new.intrinsics[:2, 2]).astype(int)
+            shifted = old.intrinsics.copy()
+            shifted[:2, 2] -= [left, top]
+            assert np.allclose(shifted, new.intrinsics)
+            whole = read_image(old.image_path).numpy()
+            kept = whole[top : top + new.height, left : left + new.width]
+            assert np.array_equal(kept, read_image(new.image_path).numpy())
+            assert kept[..., 3].sum() == whole[..., 3].sum(), "nothing of the person is cut off"
     assert not list(tmp_path.glob(".fitted*")), "nothing is left beside it"
 
 

@@ -50,8 +50,8 @@ def truth() -> np.ndarray:
     return joints
 
 
-def seen_by(views: list[View], joints: np.ndarray, noise: float = 0.0) -> Keypoints:
-    rng = np.random.default_rng(2)
+def seen_by(views: list[View], joints: np.ndarray, noise: float = 0.0, seed: int = 2) -> Keypoints:
+    rng = np.random.default_rng(seed)
     keypoints = {}
     for view in views:
         local = joints @ view.cam_from_world[:3, :3].T + view.cam_from_world[:3, 3]
