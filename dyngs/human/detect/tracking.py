@@ -32,9 +32,8 @@ class TrackingParams:
     window_margin: float = 0.25  # around a region or an expected person, of its longer side
     same_person: float = 0.15  # mean distance of key points of duplicate detections
     contained: float = 0.7  # fraction of a box inside another one, of the same person
-    max_step: float = 1.0  # mean distance of key points between linked detections
-    max_colour_distance: float = 0.7  # of clothes, between histograms, 0 to 1
-    max_resize: float = 0.7  # change of the logarithm of the height between linked detections
+    new_track: float = 1.0  # cost of not linking a detection; see ``_link_cost``
+    search_distance: float = 2.0  # largest mean distance of key points from where a search expects
     max_gap: int = 12  # images without a detection that a link may span
     min_detections: int = 3  # of a track
     still: float = 0.01  # standard deviation of key points below which a person is a picture
@@ -233,9 +232,10 @@ def _link(found: Sequence[Sequence[Detection]], images: np.ndarray) -> list[Pers
                     tracks[i], number, person, colours[i], histograms[column]
                 )
         taken = set()
-        rows, columns = linear_sum_assignment(np.where(np.isfinite(costs), costs, 1e6))
+        costs = np.minimum(costs, PARAMS.new_track)
+        rows, columns = linear_sum_assignment(costs)
         for row, column in zip(rows, columns, strict=True):
-            if np.isfinite(costs[row, column]):
+            if costs[row, column] < PARAMS.new_track:
                 i = active[row]
                 tracks[i][number] = people[column]
                 colours[i] = 0.8 * colours[i] + 0.2 * histograms[column]
@@ -258,27 +258,26 @@ def _link_cost(
     colours: np.ndarray,
     histogram: np.ndarray,
 ) -> float:
-    """Return the cost of adding a detection to a track; infinity: not the same person."""
+    """Return the cost of adding a detection to a track.
+
+    It is the mean distance of key points in heights, less after a gap, plus half of the change of
+    the logarithm of the height and of the distance between colours (0 to 1).
+    """
     last = max(track)
     points = track[last].keypoints.copy()
     before = [i for i in track if i < last]
     if before:
         motion = track[last].box - track[max(before)].box
         points[:, :2] += motion.reshape(2, 2).mean(0) * (number - last) / (last - max(before))
-    height = max(track[last].height, person.height, 1.0)
+    height = max(float(np.sqrt(track[last].height * person.height)), 1.0)
     moved = min(
         key_point_distance(points, person.keypoints),
         key_point_distance(track[last].keypoints, person.keypoints),
     )
     resized = abs(np.log(max(track[last].height, 1.0) / max(person.height, 1.0)))
     distance = 0.5 * float(np.abs(colours - histogram).sum())
-    limit = PARAMS.max_step * (1 + 0.25 * (number - last - 1))
-    is_far = moved > 0.3 * height  # nearby, light may have changed the colours
-    if moved > limit * height or resized > PARAMS.max_resize:
-        return float("inf")
-    if is_far and distance > PARAMS.max_colour_distance:
-        return float("inf")
-    return moved / height + 0.5 * resized + 0.5 * distance
+    moved /= height * (1 + 0.25 * (number - last - 1))
+    return moved + 0.5 * resized + 0.5 * distance
 
 
 def _clothes(image: np.ndarray, person: Detection) -> np.ndarray:
@@ -317,6 +316,6 @@ def _search_gaps(
         if detection is None or not _is_reliable(detection):
             continue
         apart = key_point_distance(detection.keypoints, near.keypoints)
-        if apart < 2 * PARAMS.max_step * near.height:
+        if apart < PARAMS.search_distance * near.height:
             found[number].append(_without_mask(detection))
     return [_distinct(people) for people in found]
