@@ -58,6 +58,21 @@ MIN_OUTLINE_FRACTION = 0.01
 _STRIP = 32  # image rows per median, to bound memory
 
 
+@dataclass(frozen=True)
+class Plate:
+    """Background of a fixed camera, whose images may be crops of it."""
+
+    colours: Tensor  # (H, W, 3) of all crops together
+    known: Tensor  # (H, W) bool, where the background was visible
+    corners: Mapping[int, tuple[int, int]]  # top and left of each image in it, by view index
+
+    def window(self, index: int, height: int, width: int) -> tuple[Tensor, Tensor]:
+        """Return colours (height, width, 3) and known pixels behind the image of a view."""
+        top, left = self.corners[index]
+        rows, columns = slice(top, top + height), slice(left, left + width)
+        return self.colours[rows, columns], self.known[rows, columns]
+
+
 class OutlineLoss(Loss):
     """L1 and D-SSIM; inside the mask and up to ``OUTLINE_REACH_PX`` around it, the render is
     composited over the background plate and compared with the original image.
@@ -68,20 +83,19 @@ class OutlineLoss(Loss):
     def __init__(
         self,
         photos: ImageLoader,
-        plates: Mapping[int, tuple[Tensor, Tensor]],
+        plates: Mapping[int, Plate],
         background: Tensor,
         ssim_weight: float,
         known_fraction: float,
     ) -> None:
         """Args:
         photos: training images without masks.
-        plates: by camera number, colours (H, W, 3) of the background, and where (H, W) they
-            are known.
+        plates: by camera number.
         background: (3,) background colour of the run.
         ssim_weight: weight of D-SSIM.
         known_fraction: fraction of outline pixels with a known background, for the message."""
         self._photos = photos
-        self._plates = plates
+        self.plates = plates
         self._background = background
         self._ssim_weight = ssim_weight
         self.message = (
@@ -92,12 +106,13 @@ class OutlineLoss(Loss):
     def __call__(self, look: LossInput) -> Mapping[str, Tensor]:
         rendered = look.rendered
         truth = look.truth
-        plate = self._plates.get(self._photos.views[look.index].camera_id)
+        plate = self.plates.get(self._photos.views[look.index].camera_id)
         alpha = look.image.alpha
-        if plate is not None and alpha is not None and truth.shape == plate[0].shape:
+        if plate is not None and alpha is not None and truth.shape[:2] == alpha.shape:
+            colours, known = plate.window(look.index, *alpha.shape)
             photo = self._photos[look.index].rgb_premultiplied
             colours, known, photo, background = (
-                copy_async(x, rendered.device) for x in (*plate, photo, self._background)
+                copy_async(x, rendered.device) for x in (colours, known, photo, self._background)
             )
             on_outline = (known & _silhouette_band(alpha))[..., None]
             transmittance = look.drawn.rendering.transmittance[0][..., None]
@@ -122,18 +137,30 @@ def make_outline_loss(run: StartContext) -> OutlineLoss | None:
     photos = ImageLoader([replace(view, silhouette=None) for view in views], config.data)
     if photos[0].alpha is not None:
         return None
-    plates: dict[int, tuple[Tensor, Tensor]] = {}
+    plates: dict[int, Plate] = {}
     known = total = 0.0
-    for camera, rows in _fixed_cameras(views).items():
+    for camera, corners in _fixed_cameras(views, photos.sizes).items():
+        rows = list(corners)
         indices = [rows[i] for i in evenly_spaced(len(rows), PLATE_FRAMES)]
-        alphas = torch.stack([x for i in indices if (x := run.images[i].alpha) is not None])
-        near = _silhouette_band(alphas)
-        images = [(255 * photos[i].rgb_premultiplied).round().byte() for i in indices]
-        plate = _plate(torch.stack(images), near)
+        height = max(top + photos.sizes[i][1] for i, (top, _) in corners.items())
+        width = max(left + photos.sizes[i][0] for i, (_, left) in corners.items())
+        images = torch.zeros(len(indices), height, width, 3, dtype=torch.uint8, device="cpu")
+        near = torch.ones(len(indices), height, width, dtype=torch.bool, device="cpu")
+        outside = torch.zeros_like(near)
+        for image, covered, is_outside, i in zip(images, near, outside, indices, strict=True):
+            alpha = run.images[i].alpha
+            if alpha is None:
+                continue
+            top, left = corners[i]
+            window = slice(top, top + alpha.shape[0]), slice(left, left + alpha.shape[1])
+            image[window] = (255 * photos[i].rgb_premultiplied).round().byte()
+            covered[window] = _silhouette_band(alpha)
+            is_outside[window] = alpha <= 1 - MAX_OUTSIDE_ALPHA
+        plate = _plate(images, near)
         if plate is None:
             continue
-        plates[camera] = plate
-        outline = near & (alphas <= 1 - MAX_OUTSIDE_ALPHA)
+        plates[camera] = Plate(*plate, corners)
+        outline = near & outside
         known += float((outline & plate[1]).sum())
         total += float(outline.sum())
     if not plates or known < MIN_OUTLINE_FRACTION * total:
@@ -143,25 +170,36 @@ def make_outline_loss(run: StartContext) -> OutlineLoss | None:
     )
 
 
-def _fixed_cameras(views: Sequence[View]) -> dict[int, list[int]]:
-    """Return the view indices of each camera that does not move, by camera number."""
+def _fixed_cameras(
+    views: Sequence[View], sizes: Sequence[tuple[int, int]]
+) -> dict[int, dict[int, tuple[int, int]]]:
+    """Return top and left, px, of the images of each camera that does not move, by view index, in a
+    plate that contains them all.
+
+    Images are whole, or crops at whole pixels. ``sizes`` are width and height in training.
+    """
     rows: dict[int, list[int]] = defaultdict(list)
     for row, view in enumerate(views):
         rows[view.camera_id].append(row)
-
-    def is_fixed(indices: list[int]) -> bool:
-        first = views[indices[0]]
+    cameras: dict[int, dict[int, tuple[int, int]]] = {}
+    for camera, indices in rows.items():
+        scales = np.array([sizes[i][0] / views[i].width for i in indices])
         poses = np.stack([views[i].cam_from_world for i in indices])
-        intrinsics = {
-            (views[i].intrinsics.tobytes(), views[i].width, views[i].height) for i in indices
-        }
-        return len(intrinsics) == 1 and np.allclose(poses, first.cam_from_world, atol=1e-6)
-
-    return {
-        camera: indices
-        for camera, indices in rows.items()
-        if len(indices) > SEEN_BARE and is_fixed(indices)
-    }
+        intrinsics = np.stack([views[i].intrinsics for i in indices]) * scales[:, None, None]
+        focal_lengths = intrinsics[:, [0, 1], [0, 1]]
+        shifts = intrinsics[:, :2, 2].max(0) - intrinsics[:, :2, 2]  # left, top
+        is_fixed = (
+            len(indices) > SEEN_BARE
+            and np.allclose(poses, poses[0], atol=1e-6)
+            and np.allclose(focal_lengths, focal_lengths[0], rtol=1e-6)
+            and np.allclose(shifts, shifts.round(), atol=0.02)
+        )
+        if is_fixed:
+            corners = shifts.round().astype(int)[:, ::-1].tolist()
+            cameras[camera] = {
+                i: (top, left) for i, (top, left) in zip(indices, corners, strict=True)
+            }
+    return cameras
 
 
 def _silhouette_band(alpha: Tensor) -> Tensor:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from dyngs.config import Config, DataConfig, TrainConfig
 from dyngs.data.capture import Capture, Silhouette, View
+from dyngs.data.images.images import read_image
 from dyngs.data.loader import ImageLoader
 from dyngs.human.avatar.training import OutlineLoss, make_outline_loss
 from dyngs.human.keys import HumanModel
@@ -86,6 +87,34 @@ def test_the_true_person_costs_least_though_the_mask_is_wrong(tmp_path: Path, gr
     assert float(loss_of(loss, seen, 2, alpha, rgb)) < 1e-3
     crop_image = torch.from_numpy(person(2, grown)).float()
     assert float(loss_of(loss, seen, 2, crop_image, rgb)) > 5e-3
+
+
+def test_crops_of_one_camera_share_its_background(tmp_path: Path) -> None:
+    """Images that are cropped around the person have the background of whole images behind them."""
+    seen = views(tmp_path, 1)
+    cropped = []
+    windows = []
+    for frame, view in enumerate(seen):
+        left = min(max(3 * frame - 5, 0), SIDE - 26)
+        window = slice(3, 33), slice(left, left + 26)
+        intrinsics = view.intrinsics.copy()
+        intrinsics[:2, 2] -= [left, 3]
+        files = {}
+        for name, path in (("i", view.image_path), ("m", tmp_path / f"m{frame}.png")):
+            files[name] = tmp_path / f"{name}c{frame}.png"
+            write_image(files[name], read_image(path).numpy()[window])
+        mask = Silhouette(files["m"], "white")
+        crop = replace(view, image_path=files["i"], silhouette=mask, width=26, height=30)
+        cropped.append(replace(crop, intrinsics=intrinsics))
+        windows.append(window)
+    whole, loss = make_outline_loss(run(seen)), make_outline_loss(run(cropped))
+    assert whole is not None
+    assert loss is not None
+    for frame, (view, window) in enumerate(zip(cropped, windows, strict=True)):
+        colours, known = loss.plates[0].window(frame, view.height, view.width)
+        assert float(known.float().mean()) > 0.3
+        truth = whole.plates[0].colours[window]
+        assert float((colours - truth).abs()[known].max()) < 1e-6
 
 
 def test_the_opacity_is_moved_towards_the_true_one(tmp_path: Path) -> None:
