@@ -426,6 +426,7 @@ def _mean_iou(scene: HumanScene, images: ImageLoader) -> float:
     return fmean(ious)
 
 
+OVERLAY_SIDE_PX = 800  # longest image side in ``fit_overlays.png``, before cropping
 CROP_MARGIN = 0.15
 """Margin around silhouettes in written images, as a fraction of the longest silhouette side."""
 MIN_CROPPED = 0.3  # fraction of an image that cropping must save
@@ -575,10 +576,10 @@ def write_body_file(
 def _overlays(
     capture: Capture, options: DataConfig, body: BodyTemplate, fit: CaptureFit
 ) -> np.ndarray:
-    """Return up to eight images with body outlines: mean shape in the given pose (red) and the fit
-    (green)."""
+    """Return up to eight images of the person with body outlines: mean shape in the given pose
+    (red) and the fit (green)."""
     views = capture.splits["train"]
-    images = ImageLoader(views, _at_most(options, 400))
+    images = ImageLoader(views, _at_most(options, OVERLAY_SIDE_PX))
     discs = body_discs(body, 72)
     zero_padding = torch.zeros_like(discs.weights[:, 0])
     mean = discs.with_shape(torch.zeros_like(fit.betas), zero_padding)
@@ -600,6 +601,11 @@ def _overlays(
             outside = (~inside).float()[None]
             near_edge = torch.nn.functional.max_pool2d(outside, 3, 1, 1)[0] > 0
             sheet[inside & near_edge] = sheet.new_tensor(colour)
+        box = None if image.alpha is None else silhouette_box(image.alpha, 0.5)
+        if box is not None:
+            margin = round(CROP_MARGIN * max(part.stop - part.start for part in box))
+            rows, columns = (slice(max(x.start - margin, 0), x.stop + margin) for x in box)
+            sheet = sheet[rows, columns]
         sheets.append(sheet.numpy())
     height, width = (max(sheet.shape[axis] for sheet in sheets) for axis in (0, 1))
     whole = np.ones((2 * height, 4 * width, 3), np.float32)
