@@ -69,8 +69,8 @@ class Plate:
     def window(self, index: int, height: int, width: int) -> tuple[Tensor, Tensor]:
         """Return colours (height, width, 3) and known pixels behind the image of a view."""
         top, left = self.corners[index]
-        rows, columns = slice(top, top + height), slice(left, left + width)
-        return self.colours[rows, columns], self.known[rows, columns]
+        window = slice(top, top + height), slice(left, left + width)
+        return self.colours[window], self.known[window]
 
 
 class OutlineLoss(Loss):

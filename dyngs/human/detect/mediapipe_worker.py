@@ -3,8 +3,9 @@
     PYTHON -I mediapipe_worker.py IMAGES OUT
 
 IMAGES is a folder of PNG files. For each image with a person, ``NAME.npz`` is
-written to the folder OUT with ``landmarks`` (33, 3): column, row (px) and visibility; ``positions``
-(33, 3): relative to the hips, m, x right, y down, z away from the camera; and ``mask`` (H, W) uint8.
+written to the folder OUT with ``landmarks`` (33, 3): column, row (px) and visibility;
+``positions`` (33, 3): relative to the hips, m, x right, y down, z away from the camera; and
+``mask`` (H, W) uint8.
 """
 
 import importlib

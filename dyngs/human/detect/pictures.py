@@ -1,4 +1,4 @@
-"""Pictures of detected people: who is there, and outlines and key points of the chosen person."""
+"""Pictures of detected people: one per person, and outlines and key points of the chosen one."""
 
 from __future__ import annotations
 
@@ -31,7 +31,9 @@ _BONES = (
     (14, 16),
 )
 """Pairs of COCO key points; of each limb the left one comes first."""
-_OUTLINE, _LEFT, _RIGHT = (255, 60, 60), (60, 160, 255), (255, 190, 40)
+_OUTLINE = 255, 60, 60
+_LEFT = 60, 160, 255
+_RIGHT = 255, 190, 40
 
 
 def people_sheet(views: Sequence[View], tracks: Sequence[PersonTrack]) -> np.ndarray:

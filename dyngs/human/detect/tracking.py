@@ -164,7 +164,8 @@ def _foreground_regions(images: np.ndarray) -> list[list[Box]]:
     background = background_of(half)
     regions = []
     for image in half:
-        labels, _ = ndimage.label(person_mask(background, image))  # pyright: ignore[reportGeneralTypeIssues]
+        mask = person_mask(background, image)
+        labels, _ = ndimage.label(mask)  # pyright: ignore[reportGeneralTypeIssues]
         boxes = [
             2.0 * np.array([columns.start, rows.start, columns.stop, rows.stop])
             for rows, columns in ndimage.find_objects(labels)

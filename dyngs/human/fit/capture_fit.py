@@ -610,9 +610,9 @@ def estimate_initial_poses(
 
     Up to 20 anchor frames are fitted from every heading; the most likely sequence of headings
     gives the direction that the person faces. Each frame then starts from the pose of the previous
-    one, or from the heading path where tracking left it. Without key points, tracks without the
-    path compete with it, since silhouettes from opposite sides look alike. Raises DyngsError: the
-    first frame has empty masks.
+    one, or from the heading path where tracking left it. Tracks without the path compete with it,
+    since silhouettes from opposite sides look alike. Raises DyngsError: the first frame has empty
+    masks.
     """
     first_frame = observed(0)
     if first_frame is None:
@@ -634,10 +634,9 @@ def estimate_initial_poses(
     )
     roots = _interpolate_roots(anchors, roots, len(times))
     starts: list[tuple[int, Tensor | None]] = [(heading_path[0], roots)]
-    # Silhouettes from opposite sides look alike: without key points the path may be wrong.
-    if first_frame.joints is None:
-        best = sorted(range(NUM_HEADINGS), key=lambda i: anchor_poses[0][i][2])
-        starts += [(index, None) for index in best[:2]]
+    # Silhouettes from opposite sides look alike: the path may be wrong.
+    best = sorted(range(NUM_HEADINGS), key=lambda i: anchor_poses[0][i][2])
+    starts += [(index, None) for index in best[:2]]
     tracks = []
     for number, (index, path_roots) in enumerate(starts, 1):
         tracks.append(_track_poses(standing, anchor_poses[0][index], path_roots, body, observed))
@@ -645,7 +644,7 @@ def estimate_initial_poses(
     return min(tracks, key=lambda track: track[1])[0]
 
 
-def _poses_from_key_points(
+def poses_from_key_points(
     times: Tensor,
     body: BodyDiscs,
     frames: Mapping[int, ObservedFrame],
@@ -746,26 +745,14 @@ def _try_headings(
 ) -> list[FramePose]:
     """Fit one frame from every heading; return pose, translation and error of each.
 
-    Frames after the first are fitted at half the resolution. With key points only the three best
-    headings are tried; the errors of others are infinite.
+    Frames after the first are fitted at half the resolution.
     """
     angles = torch.arange(NUM_HEADINGS, device="cpu").double() * (2 * math.pi / NUM_HEADINGS)
     starts = standing.poses[row].repeat(NUM_HEADINGS, 1, 1)
     starts[:, 0] = compose_rotations(angles[:, None] * up, starts[:, 0])
-    trans = standing.trans[row]
-    poses = [(start, trans, math.inf) for start in starts]
-    likely = list(range(NUM_HEADINGS))
-    if frame.joints is not None:
-        errors = []
-        for start in starts:
-            pose = BodyPose(axis_angle_to_matrix(start), trans, standing.scale[row])
-            joints = posed_joints(body.skeleton, pose)
-            errors.append(float(keypoint_error(joints, frame.joints, frame.cameras)))
-        likely = sorted(likely, key=errors.__getitem__)[:3]
     levels = (2, 1) if row == 0 else (2,)
-    for index in likely:
-        poses[index] = _fit_frame(standing, row, starts[index], trans, body, frame, levels)
-    return poses
+    trans = standing.trans[row]
+    return [_fit_frame(standing, row, start, trans, body, frame, levels) for start in starts]
 
 
 def _fit_frame(
@@ -967,7 +954,7 @@ def fit_capture(
         times = motion.clip.times
         betas = None
         if all(frame.joints is not None for frame in fit_views.used.values()):
-            clip, betas = _poses_from_key_points(times, discs, fit_views.used, on_progress)
+            clip, betas = poses_from_key_points(times, discs, fit_views.used, on_progress)
         else:
             clip = estimate_initial_poses(times, discs, fit_views.used.get, on_progress)
         motion = CapturedMotion(clip, motion.frames)

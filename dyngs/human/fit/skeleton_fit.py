@@ -37,7 +37,7 @@ class SkeletonParams:
     limit: float = 0.2  # weight of squared excess over joint limits
     smoothness: float = 0.5  # weight of squared second differences of joints, per (0.1 m)^2
     shape: float = 0.02  # weight of squared shape parameters
-    transition: float = 0.1  # m, mean joint motion between frames that costs as much as a unit
+    transition: float = 0.5  # m, mean joint motion between frames that costs as much as a unit
 
 
 PARAMS = SkeletonParams()
