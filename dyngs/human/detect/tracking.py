@@ -36,7 +36,7 @@ class TrackingParams:
     search_distance: float = 2.0  # largest mean distance of key points from where a search expects
     max_gap: int = 12  # images without a detection that a link may span
     min_detections: int = 3  # of a track
-    still: float = 0.01  # standard deviation of key points below which a person is a picture
+    still: float = 0.01  # median standard deviation of key points below which nobody moves
 
 
 PARAMS = TrackingParams()
@@ -66,12 +66,12 @@ class PersonTrack:
 
     @property
     def is_picture(self) -> bool:
-        """Whether the person never moves, as on a poster."""
+        """Whether the person never moves, as on a poster; detections of them are noisy."""
         points = np.stack([x.keypoints for x in self.detections.values()])
         confident = (points[..., 2] > MIN_CONFIDENCE).all(0)
         if len(points) < PARAMS.min_detections or not confident.any():
             return False
-        spread = points[:, confident, :2].std(0).max()
+        spread = np.median(points[:, confident, :2].std(0))
         return bool(spread < PARAMS.still * self.height)
 
     @property
