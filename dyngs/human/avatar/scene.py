@@ -23,6 +23,7 @@ from dyngs.gaussians.optimizer import Parameters
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep
 from dyngs.human.avatar.posing import (
     LIGHT_NOT_EXPORTED,
+    PER_FRAME,
     Anchors,
     BodyPose,
     Light,
@@ -41,7 +42,12 @@ from dyngs.human.avatar.posing import (
 )
 from dyngs.human.body.joints import SMPLX_ROWS
 from dyngs.human.body.skinning import check_tree
-from dyngs.human.motion.motion import MotionClip, captured_motion, has_same_parameters
+from dyngs.human.motion.motion import (
+    MotionClip,
+    captured_motion,
+    has_same_parameters,
+    interpolate_linearly,
+)
 from dyngs.models.renderable import Posable, Renderable, clamp_time
 
 
@@ -256,17 +262,29 @@ class HumanScene(GaussianScene, Posable):
         """Return the person in the motion of a split's views.
 
         The split ``pose``, and splits with body parameters of their own, play those. Others play
-        the training clip with refined poses, interpolated at times between its frames.
+        the training clip with refined poses; frames that were left out of it play their own body
+        parameters, with the refinements of the neighbouring training frames.
         """
         if capture.body is None:
             return self
         body_frames = capture.body[split]
-        if split != "pose" and has_same_parameters(body_frames, capture.body["train"]):
-            return self
         views = capture.splits[split]
-        return self.with_motion(
-            captured_motion(capture.root, body_frames, views, self.skeleton.joints).clip
+        clip = captured_motion(capture.root, body_frames, views, self.skeleton.joints).clip
+        if split == "pose" or not has_same_parameters(body_frames, capture.body["train"]):
+            return self.with_motion(clip)
+        if len(self.clip) == 1 or bool(torch.isin(clip.times, self.clip.times).all()):
+            return self
+        return self.with_motion(self._with_frame_corrections(clip))
+
+    def _with_frame_corrections(self, clip: MotionClip) -> MotionClip:
+        """Apply the corrections of single training frames to another part of the same clip,
+        interpolated over time; shared ones are left to ``played_clip``."""
+        poses, trans = (
+            interpolate_linearly(self.clip.times, self.learned[name].detach(), clip.times)
+            for name in PER_FRAME
         )
+        corrected = corrected_clip(SharedCorrection(self.fit.turns, 0.0), clip, poses, trans)
+        return corrected_clip(SharedCorrection(-self.fit.turns, 0.0), corrected)
 
     def drawing_state(self) -> State:
         """Return the tensors needed for rendering, with skinning weight corrections applied."""

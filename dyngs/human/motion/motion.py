@@ -281,6 +281,19 @@ def captured_motion(
     )
 
 
+def interpolate_linearly(times: Tensor, values: Tensor, at: Tensor) -> Tensor:
+    """Return ``values`` (F, ...) at ascending ``times`` (F,), interpolated at times ``at`` (G,).
+
+    Before the first and after the last time they are constant.
+    """
+    after = torch.searchsorted(times, at).clamp(1, len(times) - 1)
+    start, end = times[after - 1], times[after]
+    fractions = ((at - start) / (end - start)).clamp(0, 1).to(values)
+    fractions = fractions.view(-1, *[1] * (values.dim() - 1))
+    after = after.to(values.device)
+    return torch.lerp(values[after - 1], values[after], fractions)
+
+
 def has_same_parameters(a: BodyFrames, b: BodyFrames) -> bool:
     """True if both hold the same body parameters for the same frames."""
     pairs = ((getattr(a, name), getattr(b, name)) for name in ("poses", "trans", "scale"))
