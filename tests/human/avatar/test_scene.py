@@ -4,7 +4,10 @@ once."""
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
@@ -12,6 +15,7 @@ from torch import Tensor
 
 from dyngs.core.camera import Cameras
 from dyngs.core.state import select_prefix, strip_roles
+from dyngs.data.capture import BodyFrames, Capture, Split, View
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import render
 from dyngs.human.avatar.posing import (
@@ -107,3 +111,47 @@ def test_other_clips_get_what_holds_for_all_poses() -> None:
     assert found.poses[0, 1].tolist() == pytest.approx(wanted.tolist(), abs=1e-6)
     assert float(found.scale[0]) == pytest.approx(2)
     assert torch.equal(found.trans, clip.trans)
+
+
+def test_held_out_frames_have_their_own_poses_with_corrections_of_their_neighbours() -> None:
+    """Frames 0, 2, 4 and 6 of a clip are trained on, frames 3 and 4 are in the test split."""
+    whole = random_clip(7)
+    trained = stirred()
+    clip = whole.select(torch.tensor([0, 2, 4, 6]))
+    trained = replace(trained, clip=clip)
+    frames = BodyFrames(
+        frames=tuple(range(7)),
+        poses=whole.poses.double().numpy(),
+        trans=whole.trans.double().numpy(),
+        betas=np.zeros(10),
+        scale=np.ones(7),
+    )
+    views = tuple(
+        View(
+            name=str(frame),
+            image_path=Path(f"{frame}.png"),
+            cam_from_world=np.eye(4),
+            intrinsics=np.eye(3),
+            width=4,
+            height=4,
+            time=float(whole.times[frame]),
+            frame=frame,
+        )
+        for frame in (3, 4)
+    )
+    body: dict[Split, BodyFrames] = {"train": frames, "test": frames}
+    capture = Capture(Path(), "body_json", {"test": views}, body=body)
+    played = trained.for_split(capture, "test").played_clip
+    torch.testing.assert_close(played.poses[1], trained.played_clip.poses[2])
+    torch.testing.assert_close(played.trans[1], trained.played_clip.trans[2])
+    between = {name: trained.learned[name][1:3].detach().mean(0) for name in ("poses", "trans")}
+    wanted = corrected_clip(
+        trained.fit, whole.select(torch.tensor([3])), *(x[None] for x in between.values())
+    )
+    torch.testing.assert_close(
+        axis_angle_to_matrix(played.poses[0]),
+        axis_angle_to_matrix(wanted.poses[0]),
+        rtol=0,
+        atol=1e-5,
+    )
+    torch.testing.assert_close(played.trans[0], wanted.trans[0])
