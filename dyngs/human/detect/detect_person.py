@@ -544,6 +544,7 @@ def write_detected_person(
         result = write_fitted_capture(options, out, on_progress, inputs)
         for picture in folder.glob("*.png"):
             shutil.copy(picture, out / picture.name)
+            log(f"see {out / picture.name}")
         return result
     finally:
         shutil.rmtree(folder, ignore_errors=True)
