@@ -269,17 +269,16 @@ class CropDetector:
     def __call__(
         self, windows: Sequence[tuple[np.ndarray, np.ndarray]], side: int
     ) -> list[Detection | None]:
-        """Return the person in each window, with the mask of the window.
+        """Return the person in each window, in px of the image, with the mask of the window.
 
         Args:
-            windows: image (H, W, 3) uint8, and box (4,) of whole px in it.
+            windows: pixels (h, w, 3) uint8, and their box (4,) in the image.
             side: longest side at which a window is searched, px.
         """
         files = [self.folder / f"{row:06d}.png" for row in range(len(windows))]
         scales = []
-        for file, (image, box) in zip(files, windows, strict=True):
-            left, top, right, bottom = box.astype(int)
-            crop = np.ascontiguousarray(image[top:bottom, left:right])
+        for file, (pixels, _) in zip(files, windows, strict=True):
+            crop = np.ascontiguousarray(pixels)
             size = target_size(crop.shape[1], crop.shape[0], 1.0, side)
             write_image(file, area_downscale_uint8(torch.from_numpy(crop), *size).numpy())
             scales.append(crop.shape[1] / size[0])
@@ -301,7 +300,7 @@ def _find_people(views: Sequence[View], search: CropDetector) -> CameraPeople:
     images = np.stack([_shrunk_image(view, size) for view in views])
     tracks = find_people(
         images,
-        lambda windows: search([(images[number], box) for number, box in windows], CROP_SIDE_PX),
+        lambda windows: search([(_cut(images[i], box), box) for i, box in windows], CROP_SIDE_PX),
     )
     scale = views[0].width / size[0]
     return CameraPeople(tuple(views), tuple(track.scaled(scale) for track in tracks))
@@ -411,7 +410,8 @@ def _outline_person(
         around = pixels[top:bottom, left:right].contiguous()
         images[number] = area_downscale_uint8(around, *size).numpy()
         if number in windows:
-            crops.append((pixels.numpy(), windows[number]))
+            # a copy, so that whole images are not kept
+            crops.append((_cut(pixels.numpy(), windows[number]).copy(), windows[number]))
     person: list[Detection | None] = [None for _ in views]
     masks = np.zeros(images.shape[:3], bool)
     for number, detection in zip(numbers, search(crops, CROP_SIDE_PX), strict=True):
@@ -468,6 +468,12 @@ def _outline_person(
             keypoints[:, :2] += [left, top]
             found[view.name] = replace(detection, keypoints=keypoints)
     return written, found
+
+
+def _cut(image: np.ndarray, box: np.ndarray) -> np.ndarray:
+    """Return the pixels of an image (H, W, 3) in a box of whole px."""
+    left, top, right, bottom = box.astype(int)
+    return image[top:bottom, left:right]
 
 
 def _place_mask(
