@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,6 +14,7 @@ from torch import Tensor
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, View
+from dyngs.data.times import evenly_spaced
 from dyngs.export.camera_paths import (
     CameraPath,
     camera_path_file,
@@ -39,6 +41,9 @@ from dyngs.runs.opened import (
 
 DEFAULT_FRAMES = 120
 DEFAULT_SIZE = (960, 720)  # Image size in pixels for scenes without a capture
+ROOM_FRAMES = 24  # frames of a path in which it is checked that a person is inside the images
+ROOM_MARGIN = 0.05  # added around a person who leaves an image, in sides of the image
+MOST_ROOM = 3  # largest factor by which sides of images grow for that
 _RING = 24  # Cameras around a scene, one of which faces a person
 
 
@@ -95,9 +100,45 @@ def choose_path(opened: OpenedScene, options: PathOptions) -> CameraPath:
             *notes,
             "scene time runs from 0 to 1 along the path; change with --time or --times",
         )
+    is_given = isinstance(options.path, Cameras) or (
+        options.path is not None and camera_path_file(options.path) is not None
+    )
     if options.size is not None:
         path = replace(path, cameras=resize_cameras(path.cameras, *options.size))
+    elif not is_given and as_human_scene(scene) is not None:
+        path = replace(path, cameras=_with_room(scene, path))
     return replace(path, notes=notes, fps=path.fps if opened.fps is None else opened.fps)
+
+
+def _with_room(scene: Renderable, path: CameraPath) -> Cameras:
+    """Return the cameras with images enlarged at their borders so that a person stays inside.
+
+    Captures are cropped to the person, who may move further in another motion. Sides grow to at
+    most ``MOST_ROOM`` times their length.
+    """
+    cameras = path.cameras
+    size = torch.tensor([cameras.width, cameras.height], device="cpu")
+    low = torch.zeros(2, device="cpu")
+    high = size.float()
+    for i in evenly_spaced(len(path), ROOM_FRAMES):
+        points = framing_points(scene, None if path.times is None else path.times[i]).cpu()
+        pose = cameras.cam_from_world[i].cpu()
+        local = points @ pose[:3, :3].T + pose[:3, 3]
+        pixels = local @ cameras.intrinsics[i].cpu().T
+        pixels = pixels[pixels[:, 2] > 1e-6]
+        if not len(pixels):
+            continue
+        places = (pixels[:, :2] / pixels[:, 2:]).sort(dim=0).values
+        low = torch.minimum(low, places[int(0.01 * (len(places) - 1))])
+        high = torch.maximum(high, places[math.ceil(0.99 * (len(places) - 1))])
+    margin = ROOM_MARGIN * size
+    before = torch.where(low < 0, -low + margin, low.new_zeros(2)).ceil()
+    after = torch.where(high > size, high - size + margin, high.new_zeros(2)).ceil()
+    before, after = (x.minimum((MOST_ROOM - 1) / 2 * size).floor() for x in (before, after))
+    width, height = (size + before + after).long().tolist()
+    intrinsics = cameras.intrinsics.clone()
+    intrinsics[:, :2, 2] += before.to(intrinsics)
+    return replace(cameras, intrinsics=intrinsics, width=width, height=height)
 
 
 def render_path(
