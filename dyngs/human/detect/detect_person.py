@@ -26,7 +26,7 @@ from dyngs.core.errors import DyngsError, format_count, log_info
 from dyngs.data.capture import Capture, View, group_by_camera
 from dyngs.data.images.images import area_downscale_uint8, read_image, target_size
 from dyngs.data.read import is_capture, read_capture
-from dyngs.human.detect.detector import MIN_CONFIDENCE, Detection, Detector, MediaPipe
+from dyngs.human.detect.detector import Detection, Detector, MediaPipe
 from dyngs.human.detect.pictures import detection_sheet, people_sheet
 from dyngs.human.detect.tracking import (
     PARAMS,
@@ -37,6 +37,7 @@ from dyngs.human.detect.tracking import (
     key_point_distance,
 )
 from dyngs.human.fit.fitted_capture import FitInputs, FittedCapture, write_fitted_capture
+from dyngs.human.fit.keypoints import MIN_CONFIDENCE
 from dyngs.human.fit.viterbi import viterbi_path
 from dyngs.io.outputs import make_once, record_source, require_new_folder
 from dyngs.io.write import cache_folder, temporary_folder_beside, write_image, write_text
@@ -215,8 +216,9 @@ def detect_person(
     the images, from 1; None: the first. Views in which somebody else is in front of that person
     are left out. Left and right are made consistent over time. With a fixed camera, masks follow
     the difference from its background. Views without the person get empty masks. Results and
-    warnings are logged. With several people, ``people.png`` shows them with their numbers. Raises
-    DyngsError: nobody is detected, or no person has that number.
+    warnings are logged. ``detection.png`` shows outlines and key points; with several people,
+    ``people.png`` shows them with their numbers. Raises DyngsError: nobody is detected, or no
+    person has that number.
     """
     groups = [*group_by_camera(capture.splits).values()]
     search = CropDetector(detector, folder / "crops")
@@ -233,7 +235,10 @@ def detect_person(
         )
     if not any(subjects):
         most = max(len(camera.tracks) for camera in cameras)
-        raise DyngsError(f"{capture.root}: data.person={person}: {detector.name} found only {most}")
+        raise DyngsError(
+            f"{capture.root}: there is no person {person}; {detector.name} found {most}, so give a "
+            f"number from 1 to {most}"
+        )
     if any(len(camera.tracks) > 1 for camera in cameras):
         _describe_people(cameras, subjects, folder / "people.png", log)
     found: dict[str, Detection] = {}
@@ -242,7 +247,7 @@ def detect_person(
         prefix = "" if len(cameras) == 1 else f"camera {camera.views[0].camera_id}: "
         if subject is None:
             log(f"warning: {prefix}{detector.name} detects nobody; skipping its images")
-            masks = [np.zeros((view.height, view.width, 1), np.uint8) for view in camera.views]
+            masks = _empty_masks(camera.views)
         else:
             masks, own = _outline_person(camera, subject, search, prefix, log)
             found.update(own)
@@ -251,7 +256,10 @@ def detect_person(
         all_masks += masks
         on_progress("detecting the person, cameras", index, len(cameras))
     if not found:
-        raise DyngsError(f"{capture.root}: no view shows the person well enough")
+        raise DyngsError(
+            f"{capture.root}: the person is hidden or not recognised in all images; choose another "
+            "one (data.person) or other frames (data.frames)"
+        )
     views = [view for camera in cameras for view in camera.views]
     keypoints = [found[view.name].keypoints if view.name in found else None for view in views]
     write_image(folder / "detection.png", detection_sheet(views, all_masks, keypoints))
@@ -396,7 +404,8 @@ def _outline_person(
     covered = covered_images(subject, others)
     numbers = [number for number in subject.numbers if number not in covered]
     if not numbers:
-        raise DyngsError(f"{prefix}somebody else is in front of the person in all images")
+        log(f"warning: {prefix}somebody else is in front in all images; skipping them")
+        return _empty_masks(views), {}
     windows = {n: expand_box(subject.detections[n].box, shape) for n in numbers}
     edges = np.stack(list(windows.values()))
     union = np.concatenate([edges[:, :2].min(0), edges[:, 2:].max(0)])
@@ -432,7 +441,7 @@ def _outline_person(
     person, num_swapped = fix_left_right_swaps(person)
     heights = [scale * x.height for x in person if x is not None]
     if not heights:
-        return [np.zeros((view.height, view.width, 1), np.uint8) for view in views], {}
+        return _empty_masks(views), {}
     log(
         f"{prefix}{search.detector.name} detected the person in {len(heights)} of "
         f"{format_count(len(person), 'image')}, {np.median(heights):.0f} px high; swapped "
@@ -470,6 +479,10 @@ def _outline_person(
     return written, found
 
 
+def _empty_masks(views: Sequence[View]) -> list[np.ndarray]:
+    return [np.zeros((view.height, view.width, 1), np.uint8) for view in views]
+
+
 def _cut(image: np.ndarray, box: np.ndarray) -> np.ndarray:
     """Return the pixels of an image (H, W, 3) in a box of whole px."""
     left, top, right, bottom = box.astype(int)
@@ -483,7 +496,8 @@ def _place_mask(
     scale = (union[2] - union[0]) / size[0]
     columns = (np.arange(size[0]) + 0.5) * scale + union[0] - window[0]
     rows = (np.arange(size[1]) + 0.5) * scale + union[1] - window[1]
-    height, width = window[3] - window[1], window[2] - window[0]
+    height = window[3] - window[1]
+    width = window[2] - window[0]
     grid = np.meshgrid(
         rows * mask.shape[0] / height - 0.5, columns * mask.shape[1] / width - 0.5, indexing="ij"
     )

@@ -18,10 +18,8 @@ import numpy as np
 
 from dyngs.core.errors import DyngsError, quote_path
 from dyngs.human.detect import mediapipe_worker
+from dyngs.human.fit.keypoints import MIN_CONFIDENCE
 from dyngs.io.numpy_files import read_arrays
-
-MIN_CONFIDENCE = 0.3
-"""Confidence from which a key point is used."""
 
 
 @dataclass(frozen=True)

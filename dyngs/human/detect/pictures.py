@@ -10,8 +10,8 @@ from scipy import ndimage
 from dyngs.data.capture import View
 from dyngs.data.images.images import read_image
 from dyngs.data.times import evenly_spaced
-from dyngs.human.detect.detector import MIN_CONFIDENCE
 from dyngs.human.detect.tracking import PersonTrack, expand_box
+from dyngs.human.fit.keypoints import MIN_CONFIDENCE
 from dyngs.io.labelled_sheet import labelled_sheet
 
 CELL_PX = 320  # width and height of a picture

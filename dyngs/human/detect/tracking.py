@@ -14,7 +14,8 @@ from scipy import ndimage
 from scipy.optimize import linear_sum_assignment
 
 from dyngs.capture.masks import background_of, camera_moves, person_mask
-from dyngs.human.detect.detector import MIN_CONFIDENCE, Detection
+from dyngs.human.detect.detector import Detection
+from dyngs.human.fit.keypoints import MIN_CONFIDENCE
 
 Box = np.ndarray
 """Left, top, right and bottom edge (4,), px."""
@@ -66,7 +67,7 @@ class PersonTrack:
 
     @property
     def is_picture(self) -> bool:
-        """Whether the person never moves, as on a poster; detections of them are noisy."""
+        """Whether the key points never move, apart from noise, as of a person on a poster."""
         points = np.stack([x.keypoints for x in self.detections.values()])
         confident = (points[..., 2] > MIN_CONFIDENCE).all(0)
         if len(points) < PARAMS.min_detections or not confident.any():
@@ -104,18 +105,19 @@ def find_people(images: np.ndarray, search: Search) -> list[PersonTrack]:
         search: runs the detector in windows.
     """
     whole = np.array([0, 0, images.shape[2], images.shape[1]], np.float64)
-    found = _search([(number, whole) for number in range(len(images))], search, len(images))
+    found = _search([(number, whole) for number in range(len(images))], search, images)
     windows = [
         (number, expand_box(box, images.shape))
         for number, boxes in enumerate(_foreground_regions(images))
         for box in boxes
         if all(_covered(box, person.box) < PARAMS.contained for person in found[number])
     ]
-    in_regions = _search(windows, search, len(images))
+    in_regions = _search(windows, search, images)
     found = [people + others for people, others in zip(found, in_regions, strict=True)]
     tracks = _link([_distinct(people) for people in found], images)
+    searched: set[tuple[float, ...]] = set()
     for _ in range(2):
-        tracks = _link(_search_gaps(tracks, images, search), images)
+        tracks = _link(_search_gaps(tracks, images, search, searched), images)
     return sorted(tracks, key=lambda track: -track.size)
 
 
@@ -175,19 +177,23 @@ def _foreground_regions(images: np.ndarray) -> list[list[Box]]:
 
 
 def _search(
-    windows: Sequence[tuple[int, Box]], search: Search, num_images: int
+    windows: Sequence[tuple[int, Box]], search: Search, images: np.ndarray
 ) -> list[list[Detection]]:
     """Return the reliable detections in windows by image, without masks."""
-    found: list[list[Detection]] = [[] for _ in range(num_images)]
+    found: list[list[Detection]] = [[] for _ in images]
     for (number, _), detection in zip(windows, search(windows), strict=True):
-        if detection is not None and _is_reliable(detection):
+        if detection is not None and _is_reliable(detection, images):
             found[number].append(_without_mask(detection))
     return found
 
 
-def _is_reliable(detection: Detection) -> bool:
+def _is_reliable(detection: Detection, images: np.ndarray) -> bool:
+    """Whether enough key points are confident, and at least half of their box is in the image."""
     confident = detection.keypoints[:, 2] > MIN_CONFIDENCE
-    return int(confident.sum()) >= PARAMS.min_key_points and detection.height > 0
+    person = _without_mask(detection)
+    whole = np.array([0, 0, images.shape[2], images.shape[1]], np.float64)
+    is_inside = person.height > 0 and _covered(person.box, whole) >= 0.5
+    return int(confident.sum()) >= PARAMS.min_key_points and is_inside
 
 
 def _without_mask(detection: Detection) -> Detection:
@@ -296,10 +302,15 @@ def _clothes(image: np.ndarray, person: Detection) -> np.ndarray:
 
 
 def _search_gaps(
-    tracks: Sequence[PersonTrack], images: np.ndarray, search: Search
+    tracks: Sequence[PersonTrack],
+    images: np.ndarray,
+    search: Search,
+    searched: set[tuple[float, ...]],
 ) -> list[list[Detection]]:
-    """Return all detections by image, with those of tracks that a search where they are expected
-    adds."""
+    """Return the detections of all tracks by image, and those found where tracks have gaps.
+
+    Windows in ``searched`` are skipped; new ones are added to it.
+    """
     found: list[list[Detection]] = [[] for _ in images]
     windows: list[tuple[int, Box]] = []
     expected: list[Detection] = []
@@ -309,12 +320,17 @@ def _search_gaps(
         first = max(track.numbers[0] - PARAMS.max_gap, 0)
         last = min(track.numbers[-1] + PARAMS.max_gap, len(images) - 1)
         for number in range(first, last + 1):
-            if number not in track.detections:
+            if number in track.detections:
+                continue
+            box = expand_box(track.expected_box(number), images.shape)
+            key = (number, *box.tolist())
+            if key not in searched:
+                searched.add(key)
                 nearest = min(track.numbers, key=lambda i: abs(i - number))
-                windows.append((number, expand_box(track.expected_box(number), images.shape)))
+                windows.append((number, box))
                 expected.append(track.detections[nearest])
     for (number, _), detection, near in zip(windows, search(windows), expected, strict=True):
-        if detection is None or not _is_reliable(detection):
+        if detection is None or not _is_reliable(detection, images):
             continue
         apart = key_point_distance(detection.keypoints, near.keypoints)
         if apart < PARAMS.search_distance * near.height:

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from dyngs.data.body_frames import frame_number
 from dyngs.data.capture import View
-from dyngs.human.fit.keypoints import Keypoints
-from dyngs.human.fit.triangulation import MIN_CONFIDENCE, person_height, triangulate_joints
+from dyngs.human.fit.keypoints import MIN_CONFIDENCE, Keypoints
+from dyngs.human.fit.triangulation import person_height, triangulate_joints
 
 MIN_CAMERAS = 3  # two cameras do not tell their own error from that of the key points
 MIN_JOINTS = 100  # triangulated joints of the fitted frames

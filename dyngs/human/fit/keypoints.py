@@ -56,6 +56,8 @@ JOINTS = {
     if name.partition("_")[2] in ("eye", "shoulder", "elbow", "wrist", "hip", "knee", "ankle")
 }
 """Rows in ``JOINT_NAMES`` of joints that detectors place at the joint; necks and toes are not."""
+MIN_CONFIDENCE = 0.3
+"""Confidence from which a key point is used."""
 Keypoints = dict[str, Tensor]
 """By view name: (55, 3) column, row (undistorted, px of the stored image) and confidence; 0 for
 missing joints."""

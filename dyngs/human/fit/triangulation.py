@@ -14,9 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from dyngs.data.body_frames import frame_number
 from dyngs.data.capture import View
-from dyngs.human.fit.keypoints import Joints3D, Keypoints, RelativeJoints
+from dyngs.human.fit.keypoints import MIN_CONFIDENCE, Joints3D, Keypoints, RelativeJoints
 
-MIN_CONFIDENCE = 0.3  # of a key point that is used
 TOLERANCE = 0.05  # reprojection error of an inlier, in heights of the person in that view
 TWO_VIEW_CONFIDENCE = 0.5  # factor for joints that only two cameras confirm
 

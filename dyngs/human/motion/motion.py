@@ -287,7 +287,8 @@ def interpolate_linearly(times: Tensor, values: Tensor, at: Tensor) -> Tensor:
     Before the first and after the last time they are constant.
     """
     after = torch.searchsorted(times, at).clamp(1, len(times) - 1)
-    start, end = times[after - 1], times[after]
+    start = times[after - 1]
+    end = times[after]
     fractions = ((at - start) / (end - start)).clamp(0, 1).to(values)
     fractions = fractions.view(-1, *[1] * (values.dim() - 1))
     after = after.to(values.device)

@@ -122,7 +122,7 @@ def test_the_heading_is_found(body: BodyDiscs, monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_key_points_tell_which_way_a_turning_person_faces(body: BodyDiscs) -> None:
-    """Outlines of front and back are alike before one camera."""
+    """Front and back have the same outline before one camera."""
     place = torch.tensor([0.0, 1.0, 0.0])
     camera = ring(1, torch.tensor([0.0, 1.0, 0.0]))
     # towards the camera, then sideways, then away from it
