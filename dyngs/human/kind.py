@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from dyngs.core.conventions import ProgressCallback
+from dyngs.core.errors import DyngsError, quote_path
 from dyngs.human.keys import NO_BODY, HumanModel
 from dyngs.models.kind import HasBody, HasGaussians, PlayedMotion
 
@@ -22,7 +23,12 @@ if TYPE_CHECKING:
 class HumanKind(HasGaussians, HasBody):
     """Avatars; body poses are refined instead of camera poses."""
 
-    uses = HasGaussians.uses - {"init", "camera.refine", "train.robust", "train.priors"}
+    uses = (HasGaussians.uses | {"data.person"}) - {
+        "init",
+        "camera.refine",
+        "train.robust",
+        "train.priors",
+    }
 
     def refusal(self, capture: Capture) -> str | None:
         if capture.body is not None:
@@ -44,6 +50,11 @@ class HumanKind(HasGaussians, HasBody):
             from dyngs.human.detect.detect_person import ensure_detected_person
 
             data = ensure_detected_person(data, log=log, on_progress=on_progress)
+        elif data.person is not None:
+            raise DyngsError(
+                f"data.person={data.person}: only clips are searched for people during training; "
+                f"run `dyngs data people {quote_path(data.root)} OUT --person {data.person}` first"
+            )
         return ensure_fitted_body(
             data, section, only_if_needed=not section.fit, log=log, on_progress=on_progress
         )

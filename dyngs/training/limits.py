@@ -58,6 +58,8 @@ def _kind_specific_options(config: Config) -> dict[str, object]:
         details = {"steps", "score", "signed", "mask_between"}
         changed = section.model_dump(exclude_defaults=True, exclude=details)
         given |= {f"{name}.{key}": value for key, value in changed.items()}
+    if config.data.person is not None:
+        given["data.person"] = config.data.person
     if config.train.minutes is not None:
         given["train.minutes"] = config.train.minutes
     if config.train.image_every > 0:

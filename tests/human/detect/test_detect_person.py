@@ -26,6 +26,8 @@ from dyngs.human.detect.detect_person import (
 )
 from dyngs.human.detect.detector import Detection
 from dyngs.human.fit.keypoints import JOINTS, read_keypoints
+from dyngs.human.keys import HumanModel
+from dyngs.human.kind import HUMAN
 from dyngs.io.write import write_image
 from tests.detections import person
 
@@ -183,3 +185,17 @@ def test_a_clip_is_looked_at_once(
         assert (data.root, data.frames) == (made[-1], None)
     assert len(made) == 2
     assert [line for line in said if "using the cached result" in line] == [said[2]]
+
+
+def test_a_number_that_nobody_has_is_refused(clip: Path, tmp_path: Path) -> None:
+    with pytest.raises(DyngsError, match="there is no person 3; Rough found 1, so give a number"):
+        detect_person(
+            capture_of(clip), Rough(), tmp_path / "found", ignore_progress, [].append, person=3
+        )
+
+
+def test_a_person_cannot_be_chosen_in_a_capture_with_cameras(tmp_path: Path) -> None:
+    (tmp_path / "transforms_train.json").write_text("{}")
+    data = DataConfig(root=tmp_path, format="body_json", person=2)
+    with pytest.raises(DyngsError, match=r"data.person=2: only clips .* --person 2"):
+        HUMAN.find_body(data, HumanModel(), [].append, ignore_progress)
