@@ -41,14 +41,34 @@ SHADE = (0.5, 0.97)  # range of brightness, as a fraction of the background's, t
 SHADE_SPREAD = 0.08
 _WINDOW = 5
 _SMOOTH = 0.7
-UNSURE, SEEN_BARE = 0.02, 3
-"""Largest error of a detector's outline in heights of the person, and the number of images in
-which a background pixel must be visible."""
-AGREED = 0.8
-"""Overlap (IoU) with a detector's mask below which another person was segmented."""
+SEEN_BARE = 3  # number of images in which a background pixel must be visible
 EDGE, HALF = 2, 0.45
 """Width of the rim of a mask in px, and the fraction of the largest nearby difference that a pixel
 of the rim needs: pixels at the outline are mixed."""
+
+
+@dataclass(frozen=True)
+class MatteParams:
+    """Estimation of alpha at outlines; lengths in heights of the person.
+
+    Measured on people pasted before photos, with known alpha.
+    """
+
+    unsure: float = 0.02  # largest error of a detector's outline
+    inside: float = 0.03  # distance inside the mask up to which pixels may be background
+    # distance outside the mask up to which pixels may be of the person, in both passes
+    outside: tuple[float, float] = (0.03, 0.01)
+    core: float = 0.01  # distance from the outline at which pixels are certainly of the person
+    colours: float = 0.008  # standard deviation of the average of their colours
+    noise: float = 20.0  # grey levels, expected error of colours
+    slope: float = 2.0  # of alpha: pixels that are almost covered count as covered
+    smoothing: float = 0.0045  # standard deviation by which the outlines of masks are smoothed
+    # steepness of smoothed outlines, so that about two pixels are partly covered, as in photos
+    steepness: float = 1.6
+    agreed: float = 0.8  # overlap (IoU) with the detector's mask below which it is kept
+
+
+MATTE = MatteParams()
 
 
 @dataclass(frozen=True)
@@ -102,14 +122,11 @@ def background_of(images: np.ndarray) -> Background:
     return Background(colours, np.clip(noise, max(NOISE, typical), 3 * max(NOISE, typical)))
 
 
-def person_mask(
-    background: Background, image: np.ndarray, likely: np.ndarray | None = None
-) -> np.ndarray:
+def person_mask(background: Background, image: np.ndarray) -> np.ndarray:
     """Return the foreground mask (H, W) bool of an image (H, W, 3) uint8.
 
     Shadows, where the image is a nearly constant multiple of the background, are removed. Holes
-    are filled, as clothes may resemble the background: all of them, or those in ``likely`` (H, W)
-    of a detector.
+    are filled, as clothes may resemble the background.
     """
     away = _difference(background, image)
     sure = ndimage.binary_opening(away > HIGH, iterations=1)
@@ -120,10 +137,7 @@ def person_mask(
     closed = ndimage.binary_closing(padded, _disc(radius))[
         2 * radius : -2 * radius, 2 * radius : -2 * radius
     ]
-    filled = np.asarray(ndimage.binary_fill_holes(closed), bool)
-    opened = ndimage.binary_opening(
-        filled if likely is None else np.where(filled & likely, True, closed), _disc(1)
-    )
+    opened = ndimage.binary_opening(ndimage.binary_fill_holes(closed), _disc(1))
     rim = opened & np.logical_not(ndimage.binary_erosion(opened, iterations=EDGE, border_value=1))
     opened = opened & np.logical_not(
         rim & (away < HALF * ndimage.maximum_filter(away, 2 * EDGE + 1))
@@ -135,53 +149,98 @@ def person_mask(
     return np.isin(labels, 1 + np.flatnonzero(sizes >= LEAST_FRACTION * sizes.max()))
 
 
-def refine_outlines(
+def soften_outline(mask: np.ndarray) -> np.ndarray:
+    """Return alpha (H, W) of a mask (H, W) bool, without noise of single pixels at the outline."""
+    blurred = ndimage.gaussian_filter(mask.astype(np.float32), MATTE.smoothing * _height(mask))
+    return (0.5 + MATTE.steepness * (blurred - 0.5)).clip(0, 1)
+
+
+def estimate_alpha(
     images: np.ndarray, masks: np.ndarray, others: np.ndarray | None = None
 ) -> np.ndarray | None:
-    """Refine the outlines of a detector's masks (F, H, W) by background subtraction; None if the
-    camera moves.
+    """Return alpha (F, H, W) of a person from a detector's masks and the background of a fixed
+    camera; None if the camera moves.
 
-    The background of a pixel is the median of the images in which the detector is sure to see no
-    person. Masks are unchanged where fewer than ``SEEN_BARE`` of these exist, and in images where
-    the results disagree, as when other people pass.
+    Near the outline, alpha is the difference from the background, relative to that of the person's
+    colours nearby. The background of a pixel is the median of the images in which the detector is
+    sure to see no person. Masks are only softened where fewer than ``SEEN_BARE`` of these exist,
+    and in images where the results disagree, as when other people pass.
 
     Args:
         images: (F, H, W, 3) uint8, of one camera.
         masks: (F, H, W) bool.
-        others: (F, H, W) bool, where other people are and masks are unchanged; None: nowhere.
+        others: (F, H, W) bool, where other people are and masks are kept; None: nowhere.
     """
     static = np.where(masks[..., None], np.median(images, axis=0).astype(np.uint8), images)
     if camera_moves(static):
         return None
-    heights = [np.ptp(mask.any(1).nonzero()[0]) + 1 for mask in masks if mask.any()]
-    radius = max(2, round(UNSURE * float(np.mean(heights)))) if heights else 2
+    heights = [_height(mask) for mask in masks if mask.any()]
+    radius = max(2, round(MATTE.unsure * float(np.mean(heights)))) if heights else 2
     near: np.ndarray = np.stack(
         [ndimage.binary_dilation(mask, iterations=radius) for mask in masks]
     ).astype(bool)
     known = np.logical_not(near).sum(0) >= SEEN_BARE
     bare = np.ma.masked_array(images, np.broadcast_to(near[..., None], images.shape))
     colours = np.ma.median(bare, axis=0).filled(0).astype(np.float32)
-    away = np.ma.masked_array(np.stack([_away(colours, image) for image in images]), near | ~known)
-    noise = (1.4826 * np.ma.median(away, axis=0)).filled(NOISE).astype(np.float32)
-    typical = max(NOISE, float(np.median(noise[known]))) if known.any() else NOISE
-    background = Background(colours, np.clip(noise, typical, 3 * typical))
-    core = np.stack([ndimage.binary_erosion(mask, iterations=radius) for mask in masks])
-    reached = np.stack([ndimage.binary_dilation(mask, iterations=2 * radius) for mask in near])
-    different = np.stack(
-        [person_mask(background, x, mask) for x, mask in zip(images, masks, strict=True)]
+    background = Background(colours, np.full(known.shape, NOISE, np.float32))
+    result = np.zeros(masks.shape, np.float32)
+    for i, (image, mask) in enumerate(zip(images, masks, strict=True)):
+        result[i] = soften_outline(mask)
+        usable = known if others is None else known & ~others[i]
+        core = _inner(mask, MATTE.core)
+        if not core.any():
+            continue
+        shadow = _shadow(background, image) & ~mask
+        first = _alpha(background, image, mask, usable, shadow, MATTE.outside[0])
+        found = ndimage.binary_opening(first > 0.5)
+        labels, _ = ndimage.label(found)  # pyright: ignore[reportGeneralTypeIssues]
+        found = np.isin(labels, np.unique(labels[core & found])) & (labels > 0)
+        if (found & mask).sum() > MATTE.agreed * (found | mask).sum():
+            result[i] = _alpha(background, image, found, usable, shadow, MATTE.outside[1])
+    return result
+
+
+def _alpha(
+    background: Background,
+    image: np.ndarray,
+    mask: np.ndarray,
+    usable: np.ndarray,
+    shadow: np.ndarray,
+    outside: float,
+) -> np.ndarray:
+    """Return alpha (H, W) of a mask (H, W), estimated from colours near its outline."""
+    soft = soften_outline(mask)
+    height = _height(mask)
+    core = _inner(mask, MATTE.core).astype(np.float32)
+    # Average colour of the person nearby.
+    sigma = max(MATTE.colours * height, 1.0)
+    weights = ndimage.gaussian_filter(core, sigma)
+    sums = ndimage.gaussian_filter(image * core[..., None], (sigma, sigma, 0))
+    nearest = ndimage.distance_transform_edt(
+        weights < 1e-3, return_distances=False, return_indices=True
     )
-    is_sure = known if others is None else known & ~others
-    found = np.where(is_sure, (different & reached) | core, masks)
-    found = np.stack([_touching(mask, own) for mask, own in zip(found, core, strict=True)])
-    common = (found & masks).sum((1, 2))
-    either = (found | masks).sum((1, 2))
-    return np.where((common > AGREED * either)[:, None, None], found, masks)
+    colours = (sums / weights.clip(1e-6)[..., None])[tuple(nearest)]
+    contrast = np.square(colours - background.colours).sum(-1)
+    difference = np.square(image - background.colours).sum(-1)
+    ratio = np.sqrt(difference / contrast.clip(1.0))
+    ratio = (0.5 + MATTE.slope * (ratio - 0.5)).clip(0, 1)
+    ratio[shadow] = 0
+    confidence = contrast / (contrast + MATTE.noise**2)
+    near = (ndimage.distance_transform_edt(mask) <= MATTE.inside * height) & (
+        ndimage.distance_transform_edt(~mask) <= max(outside * height, 2)
+    )
+    return np.where(near & usable, confidence * ratio + (1 - confidence) * soft, soft)
 
 
-def _touching(mask: np.ndarray, core: np.ndarray) -> np.ndarray:
-    """Return the connected components of a mask (H, W) that contain a pixel of ``core``."""
-    labels, _ = ndimage.label(mask)  # pyright: ignore[reportGeneralTypeIssues]
-    return np.isin(labels, np.unique(labels[core & mask]))
+def _height(mask: np.ndarray) -> int:
+    """Return the number of rows from the top to the bottom of a mask (H, W)."""
+    return int(np.ptp(mask.any(1).nonzero()[0])) + 1 if mask.any() else 0
+
+
+def _inner(mask: np.ndarray, distance: float) -> np.ndarray:
+    """Return the pixels (H, W) of a mask that are further than ``distance``, in heights of the
+    person, from its outline."""
+    return ndimage.distance_transform_edt(mask) > max(distance * _height(mask), 2)
 
 
 def camera_moves(images: np.ndarray) -> bool:

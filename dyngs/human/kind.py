@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 class HumanKind(HasGaussians, HasBody):
     """Avatars; body poses are refined instead of camera poses."""
 
-    uses = (HasGaussians.uses | {"data.person"}) - {
+    uses = (HasGaussians.uses | {"data.person", "data.stature"}) - {
         "init",
         "camera.refine",
         "train.robust",

@@ -60,6 +60,8 @@ def _kind_specific_options(config: Config) -> dict[str, object]:
         given |= {f"{name}.{key}": value for key, value in changed.items()}
     if config.data.person is not None:
         given["data.person"] = config.data.person
+    if config.data.stature is not None:
+        given["data.stature"] = config.data.stature
     if config.train.minutes is not None:
         given["train.minutes"] = config.train.minutes
     if config.train.image_every > 0:

@@ -68,6 +68,13 @@ class DataConfig(Section):
         description="number of the person in a clip of several people, as `dyngs data people` "
         "lists them; null: the one who is seen largest and longest",
     )
+    stature: float | None = Field(
+        default=None,
+        ge=0.3,
+        le=3.0,
+        description="height of the person, m, for a clip of one fixed camera, which does not show "
+        "the size; null: 1.70",
+    )
     pose_frames: str | None = Field(
         default=None,
         description="time steps of a person to hold out as the split pose, as a slice of those "

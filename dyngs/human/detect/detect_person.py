@@ -18,7 +18,7 @@ import torch
 from scipy import ndimage
 
 from dyngs.capture.fixed_camera import is_image_sequence, read_fixed_camera
-from dyngs.capture.masks import refine_outlines, resize_mask
+from dyngs.capture.masks import estimate_alpha, resize_mask, soften_outline
 from dyngs.capture.sfm.photos import digest_files
 from dyngs.config import DataConfig
 from dyngs.core.conventions import ProgressCallback, ignore_progress
@@ -37,7 +37,7 @@ from dyngs.human.detect.tracking import (
     key_point_distance,
 )
 from dyngs.human.fit.fitted_capture import FitInputs, FittedCapture, write_fitted_capture
-from dyngs.human.fit.keypoints import MIN_CONFIDENCE
+from dyngs.human.fit.keypoints import KEY_POINTS, MIN_CONFIDENCE, WHOLE_BODY_ROWS
 from dyngs.human.fit.viterbi import viterbi_path
 from dyngs.io.outputs import make_once, record_source, require_new_folder
 from dyngs.io.write import cache_folder, temporary_folder_beside, write_image, write_text
@@ -46,11 +46,11 @@ SWAP_COST = 0.04
 """Cost of starting or ending a left-right swap, as key point motion in heights of the person. A
 limb mistaken for the other one in a few images moves more than this."""
 _PAIRS = {
-    "all": ((1, 2), (3, 4), (5, 6), (7, 8), (9, 10), (11, 12), (13, 14), (15, 16)),
-    "arms": ((7, 8), (9, 10)),
-    "legs": ((13, 14), (15, 16)),
+    "all": tuple((left, left + 1) for left in range(1, len(KEY_POINTS), 2)),
+    "arms": ((7, 8), (9, 10), (21, 22), (23, 24)),
+    "legs": ((13, 14), (15, 16), (17, 18), (19, 20)),
 }
-"""Pairs of left and right COCO key points."""
+"""Pairs of left and right key points, by their rows in ``KEY_POINTS``."""
 
 
 def fix_left_right_swaps(person: Sequence[Detection | None]) -> tuple[list[Detection | None], int]:
@@ -63,18 +63,20 @@ def fix_left_right_swaps(person: Sequence[Detection | None]) -> tuple[list[Detec
     """
     numbers = [number for number, x in enumerate(person) if x is not None]
     detections = [x for x in person if x is not None]
-    points = np.array([x.keypoints for x in detections], np.float64).reshape(-1, 17, 3)
+    points = np.array([x.keypoints for x in detections], np.float64).reshape(-1, len(KEY_POINTS), 3)
     heights = np.array([x.height for x in detections])
     positions = [x.positions for x in detections]
     was_swapped = np.zeros(len(points), bool)
     for pairs in _PAIRS.values():
-        swapped = _find_swaps(points, np.array(pairs), heights)
+        # Hands and feet follow; they would outvote shoulders and hips.
+        deciding = [(left, right) for left, right in pairs if left < 17]
+        swapped = _find_swaps(points, np.array(deciding), heights)
         for left, right in pairs:
             points[swapped, left], points[swapped, right] = (
                 points[swapped, right],
                 points[swapped, left],
             )
-        swap = np.arange(17)
+        swap = np.arange(len(KEY_POINTS))
         swap[np.array(pairs)] = np.array(pairs)[:, ::-1]
         positions = [
             x[swap] if is_swapped and x is not None else x
@@ -90,7 +92,7 @@ def fix_left_right_swaps(person: Sequence[Detection | None]) -> tuple[list[Detec
 
 
 def _find_swaps(points: np.ndarray, pairs: np.ndarray, heights: np.ndarray) -> np.ndarray:
-    """Return the images (F,) bool in which ``pairs`` (P, 2) of ``points`` (F, 17, 3) should be
+    """Return the images (F,) bool in which ``pairs`` (P, 2) of ``points`` (F, K, 3) should be
     swapped."""
     if len(points) < 2:
         return np.zeros(len(points), bool)
@@ -184,10 +186,6 @@ DETECTOR_SIDE_PX = 960
 """Longest side of the images in which people are searched, and of masks while they are refined."""
 CROP_SIDE_PX = 512
 """Longest side of the crops around the person in which outlines and key points are detected."""
-OUTLINE_SMOOTHING, OUTLINE_SLOPE = 0.0045, 1.6
-"""Standard deviation, in heights of the person, by which outlines are smoothed, and factor that
-makes them steeper again: noise of single pixels is removed, and about two pixels are partly
-covered, as in photos."""
 MAX_REPROJECTION_ERROR = 0.15
 """Mean distance, in heights, between epipolar lines and key points of one person in two cameras."""
 
@@ -351,7 +349,7 @@ def _epipolar_error(
         if partner is None:
             continue
         lines = _epipolar_lines(first.views[number], second.views[0], detection.keypoints[:, :2])
-        points = np.concatenate([partner.keypoints[:, :2], np.ones((17, 1))], axis=1)
+        points = np.insert(partner.keypoints[:, :2], 2, 1.0, axis=1)
         distances = np.abs((lines * points).sum(1)) / np.linalg.norm(lines[:, :2], axis=1)
         weights = detection.keypoints[:, 2] * partner.keypoints[:, 2]
         if weights.sum() > 0:
@@ -460,18 +458,20 @@ def _outline_person(
             box = (detection.box - [left, top, left, top]) / scale
             x0, y0, x1, y1 = box.clip(0).astype(int)
             their_boxes[number, y0:y1, x0:x1] = True
-    outlines = refine_outlines(images, masks, their_boxes)
-    if outlines is not None:
-        iou = (outlines & masks).sum() / max(int((outlines | masks).sum()), 1)
+    alpha = estimate_alpha(images, masks, their_boxes)
+    if alpha is None:
+        alpha = np.stack([soften_outline(mask) for mask in masks])
+    else:
+        is_person = alpha > 0.5
+        iou = (is_person & masks).sum() / max(int((is_person | masks).sum()), 1)
         log(
             f"{prefix}fixed camera: masks refined by background subtraction (IoU with the "
             f"detector's {iou:.3f})"
         )
-        masks = outlines
     written = []
     found = {}
     for number, (view, detection) in enumerate(zip(views, person, strict=True)):
-        written.append(_full_mask(masks[number], union, view))
+        written.append(_full_mask(alpha[number], union, view))
         if detection is not None:
             keypoints = detection.keypoints * np.array([scale, scale, 1.0], np.float32)
             keypoints[:, :2] += [left, top]
@@ -506,14 +506,11 @@ def _place_mask(
     return (placed > 127) & inside
 
 
-def _full_mask(mask: np.ndarray, union: np.ndarray, view: View) -> np.ndarray:
-    """Return the mask of the region ``union`` as grey levels (H, W, 1) uint8 of a whole image."""
+def _full_mask(alpha: np.ndarray, union: np.ndarray, view: View) -> np.ndarray:
+    """Return alpha of the region ``union`` as grey levels (H, W, 1) uint8 of a whole image."""
     left, top, right, bottom = union.astype(int)
-    height = np.ptp(mask.any(1).nonzero()[0]) if mask.any() else 0
-    blurred = ndimage.gaussian_filter(mask.astype(np.float32), OUTLINE_SMOOTHING * height)
-    soft = (0.5 + OUTLINE_SLOPE * (blurred - 0.5)).clip(0, 1)
     whole = np.zeros((view.height, view.width, 1), np.uint8)
-    whole[top:bottom, left:right] = resize_mask(soft, bottom - top, right - left)
+    whole[top:bottom, left:right] = resize_mask(alpha, bottom - top, right - left)
     return whole
 
 
@@ -523,18 +520,20 @@ def _shrunk_image(view: View, size: tuple[int, int]) -> np.ndarray:
 
 
 def _write_keypoints(path: Path, people: Mapping[str, Detection]) -> None:
-    """Write the key points of each view, by name, as a COCO file, with relative positions beside
-    them."""
+    """Write the key points of each view, by name, as a COCO-WholeBody file, with the relative
+    positions of the first 17 beside them."""
     images = [{"id": row, "file_name": f"{name}.png"} for row, name in enumerate(people)]
     annotations = []
     for row, person in enumerate(people.values()):
+        whole_body = np.zeros((133, 3))
+        whole_body[list(WHOLE_BODY_ROWS)] = person.keypoints
         annotation: dict[str, object] = {
             "image_id": row,
             "category_id": 1,
-            "keypoints": [round(float(x), 4) for x in person.keypoints.ravel()],
+            "keypoints": whole_body.ravel().round(4).tolist(),
         }
         if person.positions is not None:
-            annotation["positions"] = [round(float(x), 4) for x in person.positions.ravel()]
+            annotation["positions"] = person.positions[:17].ravel().round(4).tolist()
         annotations.append(annotation)
     write_text(path, json.dumps({"images": images, "annotations": annotations}) + "\n")
 
@@ -582,7 +581,7 @@ def ensure_detected_person(
     Raises DyngsError: there is no detector, or see ``write_detected_person``.
     """
     name = re.sub(r"[^A-Za-z0-9-]", "_", data.root.stem)[:40]
-    chosen = data.frames if data.person is None else (data.frames, data.person)
+    chosen = (data.frames, data.person, data.stature)
     frames_hash = hashlib.sha256(repr(chosen).encode()).hexdigest()[:8]
     folder = cache_folder("people") / f"{name}.{digest_files(data.root)}{frames_hash}"
 
@@ -593,4 +592,4 @@ def ensure_detected_person(
 
     make_once(folder, detect, log, f"person:  using the cached result in {folder}")
     record_source(folder, data.root)
-    return data.model_copy(update={"root": folder, "frames": None, "person": None})
+    return data.model_copy(update={"root": folder, "frames": None, "person": None, "stature": None})

@@ -27,9 +27,10 @@ class Detection:
     """Person detected in an image.
 
     Attributes:
-        keypoints: (17, 3) float32 in COCO order: column and row, px, and confidence in [0, 1].
+        keypoints: (25, 3) float32 in the order of ``KEY_POINTS``: column and row, px, and confidence
+            in [0, 1].
         mask: (H, W) uint8, 255 = the person.
-        positions: (17, 3) float32, estimated positions of the key points relative to the hips, in
+        positions: (25, 3) float32, estimated positions of the key points relative to the hips, in
             axes of the camera (x right, y down, z forward), m; None: not estimated.
     """
 
@@ -83,8 +84,11 @@ INSTALL_HINT = (
     f"then pass --mediapipe ENV/bin/python or set {MEDIAPIPE_VARIABLE} to it"
 )
 MASKS_HINT = "or pass masks of another program to `dyngs data fit` (`dyngs docs people`)"
-LANDMARKS = (0, 2, 5, 7, 8, 11, 12, 13, 14, 15, 16, 23, 24, 25, 26, 27, 28)
-"""MediaPipe landmarks that correspond to the COCO key points, in COCO order."""
+LANDMARKS = (
+    *(0, 2, 5, 7, 8, 11, 12, 13, 14, 15, 16, 23, 24, 25, 26, 27, 28),
+    *(31, 32, 29, 30, 19, 20, 17, 18),
+)
+"""MediaPipe landmarks in the order of ``KEY_POINTS``."""
 _SECONDS_PER_IMAGE, _SECONDS_TO_START = 10.0, 120.0
 
 

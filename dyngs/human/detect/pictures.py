@@ -29,8 +29,12 @@ _BONES = (
     (13, 15),
     (12, 14),
     (14, 16),
+    (15, 17),
+    (16, 18),
+    (9, 21),
+    (10, 22),
 )
-"""Pairs of COCO key points; of each limb the left one comes first."""
+"""Pairs of rows in ``KEY_POINTS``; of each limb the left one comes first."""
 _OUTLINE = 255, 60, 60
 _LEFT = 60, 160, 255
 _RIGHT = 255, 190, 40
@@ -59,7 +63,7 @@ def detection_sheet(
     Args:
         views: of all cameras.
         masks: (H, W, 1) uint8 of each view.
-        keypoints: (17, 3) of each view, px; None: nobody.
+        keypoints: (25, 3) of each view, px; None: nobody.
     """
     from PIL import Image, ImageDraw
 

@@ -150,7 +150,7 @@ def covered_images(track: PersonTrack, others: Sequence[PersonTrack]) -> set[int
 
 
 def key_point_distance(a: np.ndarray, b: np.ndarray) -> float:
-    """Return the mean distance, px, of key points (17, 3) that are confident in both; infinity:
+    """Return the mean distance, px, of key points (25, 3) that are confident in both; infinity:
     none."""
     both = (a[:, 2] > MIN_CONFIDENCE) & (b[:, 2] > MIN_CONFIDENCE)
     if not both.any():

@@ -37,10 +37,11 @@ from dyngs.data.times import evenly_spaced
 from dyngs.human.avatar.pose_fit import SILHOUETTE_COMPARISON, fit_poses_to_images
 from dyngs.human.avatar.posing import frame_pose
 from dyngs.human.avatar.scene import HumanScene
-from dyngs.human.body.body import NUM_FITTED_SHAPES, BodyTemplate
+from dyngs.human.body.body import NUM_FITTED_SHAPES, BodyTemplate, apply_shape
 from dyngs.human.body.body_reader import has_same_shape_space, load_template, rest_shape
 from dyngs.human.fit.camera_refinement import refine_cameras
 from dyngs.human.fit.capture_fit import (
+    STATURE,
     CaptureFit,
     body_discs,
     collect_fitted_clips,
@@ -121,6 +122,13 @@ def write_fitted_capture(
         capture = read_person_capture(options, inputs, masks)
         capture = capture.replace(splits=assign_frame_numbers(capture.splits))
         views = capture.splits["train"]
+        is_size_known = capture.body is not None or inputs.joints is not None
+        centre = None if is_size_known else _fixed_camera_centre(views)
+        if options.stature is not None and centre is None:
+            raise DyngsError(
+                f"data.stature={options.stature:g}: the size of the person in {capture.root} is "
+                "known from several camera positions, or given poses; remove it"
+            )
         # The fit starts from the shape of a known person, or from that of the capture.
         known_body = person
         if known_body is None and body.name != "anny" and capture.body is not None:
@@ -151,13 +159,21 @@ def write_fitted_capture(
             keypoints,
             joints=joints,
             relative_joints={frame: x for frame, x in relative.items() if frame not in joints},
-            one_camera=capture.format == FORMAT,
+            one_camera=centre is not None,
             shape_known=person is not None,
         )
         betas = known_betas(body, known_body)
         betas[: len(fit.betas)] += fit.betas
         new_poses = place_new_poses(capture, options, shaped, fit, on_progress)
         clips = collect_fitted_clips(capture, shaped, fit, new_poses)
+        stature = options.stature or STATURE
+        if centre is not None:
+            height = _standing_height(shaped, fit)
+            if person is not None and options.stature is None:
+                stature = height * float(person.scale.mean())
+            factor = stature / (height * float(fit.clip.scale.mean()) * capture.world_scale)
+            for split, clip in clips.items():
+                clips[split] = _enlarge(clip, factor, centre)
         by_avatar: list[AvatarPoseFit] = []
         if inputs.avatar is not None:
             for split, clip in clips.items():
@@ -207,7 +223,33 @@ def write_fitted_capture(
         f"{chosen.per_frame[worst]:.3f}); see {out / 'fit_overlays.png'}",
         *(x.summary() for x in (cameras, new_poses, *by_avatar) if x is not None),
     ]
+    if centre is not None:
+        lines.append(
+            f"one camera does not show the size: the person is taken to be {stature:.2f} m high; "
+            "data.stature=METRES sets it"
+        )
     return FittedCapture(out, fit, model, "\n".join(lines))
+
+
+def _fixed_camera_centre(views: Sequence[View]) -> torch.Tensor | None:
+    """Return the position (3,) of the camera in world coordinates; None if there are several."""
+    poses = np.stack([view.cam_from_world for view in views])
+    if not np.allclose(poses, poses[0], atol=1e-6):
+        return None
+    return torch.from_numpy(np.linalg.inv(poses[0])[:3, 3]).float()
+
+
+def _standing_height(body: BodyTemplate, fit: CaptureFit) -> float:
+    """Return the height, m, of the fitted body in the rest pose, before it is scaled."""
+    vertices, _ = apply_shape(body, fit.betas)
+    return float(vertices[:, 1].max() - vertices[:, 1].min())
+
+
+def _enlarge(motion: CapturedMotion, factor: float, centre: torch.Tensor) -> CapturedMotion:
+    """Scale a person about the camera centre (3,), which leaves the images unchanged."""
+    clip = motion.clip
+    trans = centre + factor * (clip.trans - centre)
+    return replace(motion, clip=replace(clip, trans=trans, scale=factor * clip.scale))
 
 
 def _evaluation_views(num_held_out: int) -> str:
@@ -687,7 +729,7 @@ def _digest(data: DataConfig) -> str:
         files = sorted(path for path in paths if path.stat().st_size < 100_000_000)
     names = (
         "format frames pose_frames train_cameras times frames_per_second test_every test_first "
-        "skip_missing"
+        "skip_missing stature"
     )
     options = data.model_dump(mode="json", include=set(names.split()))
     options_hash = hashlib.sha256(repr(sorted(options.items())).encode()).hexdigest()[:8]

@@ -34,10 +34,15 @@ _MHR_70 = f"""
 nose left_eye right_eye left_ear right_ear left_shoulder right_shoulder left_elbow right_elbow left_hip right_hip
 left_knee right_knee left_ankle right_ankle {26 * "- "} right_wrist {20 * "- "} left_wrist
 """
+# After the body: the feet, the face, and 21 points of each hand.
+_WHOLE_BODY = f"""
+{_COCO} left_toe - left_heel right_toe - right_heel {68 * "- "} {5 * "- "} left_index1 {11 * "- "} left_pinky1
+{3 * "- "} {5 * "- "} right_index1 {11 * "- "} right_pinky1 {3 * "- "}
+"""
 _IN_IMAGES = {
     17: _COCO.split(),
-    133: _COCO.split(),
-    25: _BODY_25.split(),
+    133: _WHOLE_BODY.split(),
+    25: f"{_BODY_25} - - left_toe - left_heel right_toe - right_heel".split(),
     18: _BODY_25.replace("left_wrist -", "left_wrist").split(),
 }
 """Names of the first 2D key points by the number of key points in the format."""
@@ -53,9 +58,20 @@ _IN_SPACE = {
 JOINTS = {
     name: row
     for row, name in enumerate(JOINT_NAMES)
-    if name.partition("_")[2] in ("eye", "shoulder", "elbow", "wrist", "hip", "knee", "ankle")
+    if name.partition("_")[2]
+    in ("eye", "shoulder", "elbow", "wrist", "hip", "knee", "ankle", "foot", "index1", "pinky1")
 }
-"""Rows in ``JOINT_NAMES`` of joints that detectors place at the joint; necks and toes are not."""
+"""Rows in ``JOINT_NAMES`` of joints that detectors place at the joint; necks are not. Those of the
+feet follow from heels and toes."""
+BALL_OF_FOOT = 0.72  # position of the foot's joint between heel (0) and tip of the toes (1)
+KEY_POINTS = (
+    *_COCO.split(),
+    *("left_toe", "right_toe", "left_heel", "right_heel"),
+    *("left_index1", "right_index1", "left_pinky1", "right_pinky1"),
+)
+"""Names of the K = 25 key points of a ``Detection``: those of COCO, then of feet and hands."""
+WHOLE_BODY_ROWS = tuple(_WHOLE_BODY.split().index(name) for name in KEY_POINTS)
+"""Rows of ``KEY_POINTS`` among the 133 key points of COCO-WholeBody."""
 MIN_CONFIDENCE = 0.3
 """Confidence from which a key point is used."""
 Keypoints = dict[str, Tensor]
@@ -84,7 +100,7 @@ def read_keypoints(path: Path, views: Sequence[View]) -> Keypoints:
     """Read the key points of views from a folder of OpenPose files or from a COCO file.
 
     OpenPose: ``NAME_keypoints.json`` or ``NAME.json`` per image, ``pose_keypoints_2d`` with 25 or
-    18 points. COCO: 17 or 133 points. The most confident of several people is used. Raises
+    18 points. COCO: 17 or 133 points (with feet and hands). The most confident of several people is used. Raises
     DyngsError: another format, or no view of the capture.
     """
     named = _by_name(views)
@@ -158,6 +174,13 @@ def _marked_joints(file: Path, numbers: object, view: View) -> Tensor:
     for name, point in zip(names, points, strict=False):
         if name in JOINTS and point[2] > 0:
             joints[JOINTS[name]] = torch.from_numpy(point)
+    for side in ("left", "right"):
+        if f"{side}_toe" in names:
+            toe, heel = (points[names.index(f"{side}_{part}")] for part in ("toe", "heel"))
+            ball = heel + BALL_OF_FOOT * (toe - heel)
+            ball[2] = min(toe[2], heel[2])
+            if ball[2] > 0:
+                joints[JOINTS[f"{side}_foot"]] = torch.from_numpy(ball)
     positions = undistort_points(view.lens, view.intrinsics, joints[:, :2])
     # Positions further away, px, and NaN are outliers.
     near = (positions.abs() < 1e6).all(1, keepdim=True)

@@ -11,9 +11,9 @@ from dyngs.human.detect.detect_person import fix_left_right_swaps
 from dyngs.human.detect.detector import Detection
 from tests.detections import person
 
-LEFT = [1, 3, 5, 7, 9, 11, 13, 15]
-RIGHT = [2, 4, 6, 8, 10, 12, 14, 16]
-ARMS = ([7, 9], [8, 10])
+LEFT = list(range(1, 25, 2))
+RIGHT = list(range(2, 25, 2))
+ARMS = ([7, 9, 21, 23], [8, 10, 22, 24])
 NOBODY = np.zeros((4, 4), np.uint8)
 
 

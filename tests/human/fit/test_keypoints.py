@@ -14,7 +14,7 @@ from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, Lens, View
 from dyngs.data.images.lens import distort
 from dyngs.human.body.joints import JOINT_NAMES
-from dyngs.human.fit.keypoints import JOINTS, read_joints, read_keypoints
+from dyngs.human.fit.keypoints import JOINTS, KEY_POINTS, read_joints, read_keypoints
 
 
 def view(name: str) -> View:
@@ -61,6 +61,40 @@ def test_coco(tmp_path: Path, count: int) -> None:
     assert list(found) == ["b"]
     assert found["b"][JOINTS["left_shoulder"]].tolist() == [5, 10, 1]
     assert found["b"][JOINTS["left_knee"], 2] == 0
+
+
+@pytest.mark.parametrize(("count", "toe", "heel"), [(25, 19, 21), (133, 17, 19)])
+def test_feet_lie_between_heel_and_toes(tmp_path: Path, count: int, toe: int, heel: int) -> None:
+    marked = points(count)
+    if count == 25:
+        openpose(tmp_path / "k", "a", marked)
+        found = read_keypoints(tmp_path / "k", [view("a")])
+    else:
+        write_coco(tmp_path / "k", marked)
+        found = read_keypoints(tmp_path / "k.json", [view("a")])
+    column, row, confidence = found["a"][JOINTS["left_foot"]].tolist()
+    assert heel > column > toe
+    assert abs(column - toe) < abs(column - heel)
+    assert (row, confidence) == (pytest.approx(2 * column), 0.5)
+
+
+def write_coco(stem: Path, marked: np.ndarray) -> None:
+    fields = {
+        "images": [{"id": 1, "file_name": "a.png"}],
+        "annotations": [{"image_id": 1, "keypoints": marked.ravel().tolist()}],
+    }
+    stem.with_suffix(".json").write_text(json.dumps(fields))
+
+
+def test_knuckles_of_whole_body_key_points(tmp_path: Path) -> None:
+    write_coco(tmp_path / "k", points(133))
+    found = read_keypoints(tmp_path / "k.json", [view("a")])
+    columns = {name: float(found["a"][row, 0]) for name, row in JOINTS.items()}
+    assert columns["left_index1"] == 96
+    assert columns["left_pinky1"] == 108
+    assert columns["right_index1"] == 117
+    assert columns["right_pinky1"] == 129
+    assert [columns[name] for name in KEY_POINTS[5:17]] == list(range(5, 17))
 
 
 def test_points_are_undistorted(tmp_path: Path) -> None:
