@@ -227,12 +227,9 @@ def crop_window(image: Image, left: int, top: int, side: int) -> Image:
 
     The square is shifted to lie inside the image, and smaller only if the image is.
     """
-    camera = image.cameras
-    width = min(side, camera.width)
-    height = min(side, camera.height)
-    left = min(max(left, 0), camera.width - width)
-    top = min(max(top, 0), camera.height - height)
-    return crop_image(image, top, left, height, width)
+    left = max(min(left, image.cameras.width - side), 0)
+    top = max(min(top, image.cameras.height - side), 0)
+    return crop_image(image, top, left, side, side)
 
 
 def mesh_normals(vertices: Tensor, faces: Tensor) -> Tensor:

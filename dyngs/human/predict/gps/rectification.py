@@ -15,6 +15,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
+from typing import Any
 
 import numpy as np
 import torch
@@ -339,31 +340,23 @@ def is_inside(image: Image, points: Tensor) -> Tensor:
 def crop_to_person(image: Image, margin: int) -> Image:
     """Crop an image to its visible part plus ``margin`` px, with its camera."""
     assert image.alpha is not None
-    rows, columns = ((image.alpha > 0).any(side).nonzero()[:, 0] for side in (1, 0))
-    if not len(rows):
+    visible = (image.alpha > 0).nonzero()
+    if not len(visible):
         return image
-    (top, bottom), (left, right) = (
-        (max(0, int(x[0]) - margin), min(size, int(x[-1]) + 1 + margin))
-        for x, size in zip((rows, columns), image.alpha.shape, strict=True)
-    )
+    top, left = (visible.amin(0) - margin).clamp_min(0).tolist()
+    bottom, right = (visible.amax(0) + 1 + margin).tolist()
     return crop_image(image, top, left, bottom - top, right - left)
 
 
 def crop_image(image: Image, top: int, left: int, height: int, width: int) -> Image:
-    """Crop an image at a row and column, with its camera and maps."""
+    """Crop an image at a row and column, with its camera and maps; smaller where the image ends."""
+    tensors: Any = {
+        name: x[top : top + height, left : left + width].contiguous()
+        for name, x in image.tensors().items()
+    }
     camera = image.cameras
     intrinsics = camera.intrinsics.clone()
-    intrinsics[:, 0, 2] -= left
-    intrinsics[:, 1, 2] -= top
-
-    def part(x: Tensor) -> Tensor:
-        return x[top : top + height, left : left + width].contiguous()
-
-    names = ("alpha", "mask", "depth", "motion_mask", "flow")
-    maps = {name: part(x) for name in names if (x := getattr(image, name)) is not None}
-    return replace(
-        image,
-        cameras=Cameras(camera.cam_from_world, intrinsics, width, height),
-        rgb_premultiplied=part(image.rgb_premultiplied),
-        **maps,
-    )
+    intrinsics[:, :2, 2] -= intrinsics.new_tensor([left, top])
+    height, width = tensors["rgb_premultiplied"].shape[:2]
+    cameras = Cameras(camera.cam_from_world, intrinsics, width, height)
+    return replace(image, cameras=cameras, **tensors)
