@@ -30,15 +30,16 @@ from dyngs.core.metrics import psnr
 from dyngs.data.loader import Image
 from dyngs.data.read import list_captures
 from dyngs.human.body.body_reader import default_template
-from dyngs.human.predict.fields.network import SourceFeatures, sample_maps
-from dyngs.human.predict.gps.rectification import crop_to_person
+from dyngs.human.predict.fields.network import SourceFeatures
 from dyngs.human.predict.people import (
     MARGIN,
     Person,
     Sources,
     cameras_in_metres,
     crop_source_images,
+    crop_to_person,
     read_captured_person,
+    sample_maps,
 )
 from dyngs.human.synthetic.capture import PeopleOptions, write_people
 from dyngs.io.write import write_text

@@ -30,7 +30,6 @@ from dyngs.human.body.body import BodyTemplate, skin
 from dyngs.human.body.body_reader import rest_shape
 from dyngs.human.body.mesh import vertex_normals
 from dyngs.human.motion.motion import CapturedMotion, captured_motion
-from dyngs.human.predict.gps.rectification import crop_image, crop_to_person
 from dyngs.ops.device import CPU
 from dyngs.ops.patches import visible_patches
 
@@ -206,11 +205,10 @@ def crop_source_images(images: Sequence[Image], scale: float) -> Sources:
     cameras = [cameras_in_metres(crop.cameras, scale) for crop in crops]
     width = _padded(max(camera.width for camera in cameras))
     height = _padded(max(camera.height for camera in cameras))
-    rgba = []
-    for crop in crops:
-        assert crop.alpha is not None
-        planes = torch.cat([crop.rgb_premultiplied, crop.alpha[..., None]], -1).permute(2, 0, 1)
-        rgba.append(pad(planes, (0, width - planes.shape[2], 0, height - planes.shape[1])))
+    rgba = [
+        pad(image_planes(crop), (0, width - camera.width, 0, height - camera.height))
+        for crop, camera in zip(crops, cameras, strict=True)
+    ]
     return Sources(
         torch.stack(rgba),
         torch.cat([x.cam_from_world for x in cameras]),
@@ -222,6 +220,30 @@ def _padded(side: int) -> int:
     return -(-side // MULTIPLE) * MULTIPLE
 
 
+def crop_to_person(image: Image, margin: int) -> Image:
+    """Crop an image to its visible part plus ``margin`` px, with its camera."""
+    visible = (image_planes(image)[3] > 0).nonzero()
+    if not len(visible):
+        return image
+    top, left = (visible.amin(0) - margin).clamp_min(0).tolist()
+    bottom, right = (visible.amax(0) + 1 + margin).tolist()
+    return crop_image(image, top, left, bottom - top, right - left)
+
+
+def crop_image(image: Image, top: int, left: int, height: int, width: int) -> Image:
+    """Crop an image at a row and column, with its camera and maps; smaller where the image ends."""
+    tensors: Any = {
+        name: x[top : top + height, left : left + width].contiguous()
+        for name, x in image.tensors().items()
+    }
+    camera = image.cameras
+    intrinsics = camera.intrinsics.clone()
+    intrinsics[:, :2, 2] -= intrinsics.new_tensor([left, top])
+    height, width = tensors["rgb_premultiplied"].shape[:2]
+    cameras = Cameras(camera.cam_from_world, intrinsics, width, height)
+    return replace(image, cameras=cameras, **tensors)
+
+
 def crop_window(image: Image, left: int, top: int, side: int) -> Image:
     """Crop a square of ``side`` px at a column and row, with camera and depth.
 
@@ -230,6 +252,24 @@ def crop_window(image: Image, left: int, top: int, side: int) -> Image:
     left = max(min(left, image.cameras.width - side), 0)
     top = max(min(top, image.cameras.height - side), 0)
     return crop_image(image, top, left, side, side)
+
+
+def image_planes(image: Image) -> Tensor:
+    """Return premultiplied colours and alpha (4, H, W); alpha is 1 in images without it."""
+    alpha = image.alpha
+    if alpha is None:
+        alpha = torch.ones_like(image.rgb_premultiplied[..., 0])
+    return torch.cat([image.rgb_premultiplied, alpha[..., None]], dim=-1).permute(2, 0, 1)
+
+
+def sample_maps(
+    maps: Tensor, grid: Tensor, mode: str = "bilinear", outside: str = "zeros"
+) -> Tensor:
+    """Sample maps (V, D, h, w) at positions (V, M, 2) in [-1, 1]; return (V, M, D).
+
+    ``outside`` is the padding mode of ``grid_sample``.
+    """
+    return grid_sample(maps, grid[:, None], mode, outside, align_corners=False)[:, :, 0].mT
 
 
 def mesh_normals(vertices: Tensor, faces: Tensor) -> Tensor:

@@ -35,12 +35,11 @@ from dyngs.human.predict.fields.network import (
     initialize_network,
     mean_and_variance,
     mean_over_views,
-    sample_maps,
     sample_offsets,
     view_weights,
 )
 from dyngs.human.predict.keys import EgHumanNerfKeys
-from dyngs.human.predict.people import DILATION
+from dyngs.human.predict.people import DILATION, sample_maps
 from dyngs.models.volume import camera_rays
 from dyngs.ops.rays import Rays
 

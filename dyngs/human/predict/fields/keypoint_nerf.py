@@ -31,12 +31,11 @@ from dyngs.human.predict.fields.network import (
     initialize_network,
     mean_and_variance,
     mean_over_views,
-    sample_maps,
     sample_offsets,
     view_weights,
 )
 from dyngs.human.predict.keys import EgHumanNerfKeys
-from dyngs.human.predict.people import NUM_KEY_POINTS, Sources
+from dyngs.human.predict.people import NUM_KEY_POINTS, Sources, sample_maps
 from dyngs.models.volume import select_samples, visible_samples
 from dyngs.ops.rays import MarchSteps, Rays, Space, composite, march
 

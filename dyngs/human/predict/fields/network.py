@@ -13,12 +13,12 @@ from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import grid_sample, normalize
+from torch.nn.functional import normalize
 
 from dyngs.core.camera import Cameras
 from dyngs.data.loader import Image
 from dyngs.human.predict.keys import EgHumanNerfKeys
-from dyngs.human.predict.people import PosedBody, Sources
+from dyngs.human.predict.people import PosedBody, Sources, sample_maps
 from dyngs.models.prediction import Encoder, initialize_weights, upsample
 from dyngs.models.volume import camera_rays
 from dyngs.ops.perceptron import Layer, perceptron
@@ -131,12 +131,6 @@ class SourceFeatures:
         from_images = normalize(points - self.sources.cameras.centers[:, None], dim=-1)
         difference = normalize(directions - from_images, dim=-1)
         return torch.cat([difference, (directions * from_images).sum(-1, keepdim=True)], -1)
-
-
-def sample_maps(maps: Tensor, grid: Tensor, mode: str = "bilinear") -> Tensor:
-    """Sample maps (V, D, h, w) at positions (V, M, 2) in [-1, 1]; return (V, M, D), 0 outside."""
-    sampled = grid_sample(maps, grid[:, None], mode=mode, padding_mode="zeros", align_corners=False)
-    return sampled[:, :, 0].mT
 
 
 def initialize_network(network: nn.Module, generator: torch.Generator) -> None:

@@ -29,10 +29,10 @@ from dyngs.human.predict.gps.rectification import (
     MAX_ANGLE,
     MIN_ANGLE,
     angle_between_views,
+    rings_of_views,
     spread,
     spread_around_person,
     training_pairs,
-    views_by_time,
 )
 from dyngs.human.predict.keys import PredictedFieldModel
 from dyngs.human.predict.people import (
@@ -247,7 +247,7 @@ class FieldLearner(CaptureLearner[FieldNetwork, Person]):
         if self.section.training_views == "between":
             pair, between = random_item(training_pairs(person.views), generator)
             return list(pair), random_item(between, generator)
-        rings = [ring for ring in views_by_time(person.views).values() if len(ring) > FEWEST_VIEWS]
+        rings = [ring for ring in rings_of_views(person.views) if len(ring) > FEWEST_VIEWS]
         ring = random_item(rings, generator)
         max_count = min(self.section.source_views, len(ring) - 1)
         count = FEWEST_VIEWS + random_index(max_count - FEWEST_VIEWS + 1, generator)
@@ -267,7 +267,7 @@ class FieldLearner(CaptureLearner[FieldNetwork, Person]):
                 f"{data.root}: no view lies between two others at most {MAX_ANGLE:g} degrees "
                 "apart; use model.training_views=any"
             )
-        if all(len(ring) <= FEWEST_VIEWS for ring in views_by_time(captured.views).values()):
+        if all(len(ring) <= FEWEST_VIEWS for ring in rings_of_views(captured.views)):
             raise DyngsError(f"{data.root}: training needs a time step with three or more views")
         if self.network.needs_depth and any(view.depth_path is None for view in captured.views):
             raise DyngsError(

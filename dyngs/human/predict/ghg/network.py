@@ -19,7 +19,7 @@ import torch
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import KDTree
 from torch import Tensor, nn
-from torch.nn.functional import elu, grid_sample, max_pool2d, normalize, pad
+from torch.nn.functional import elu, max_pool2d, normalize, pad
 
 from dyngs.config import Config, DataConfig
 from dyngs.config.io import load_config, packaged_preset
@@ -45,7 +45,14 @@ from dyngs.human.body.body_reader import load_template
 from dyngs.human.fit.fitted_capture import ensure_fitted_body
 from dyngs.human.keys import HumanModel, HumanPredictorModel
 from dyngs.human.predict.gps.rectification import spread
-from dyngs.human.predict.people import Person, captured_person, depths, mesh_normals
+from dyngs.human.predict.people import (
+    Person,
+    captured_person,
+    depths,
+    image_planes,
+    mesh_normals,
+    sample_maps,
+)
 from dyngs.models.checkpoint import CONFIG_ADVICE, Checkpoint
 from dyngs.models.prediction import (
     Encoder,
@@ -210,9 +217,8 @@ def observe_texels(person: AtlasPerson, images: Iterable[tuple[Image, BodyPose]]
         camera = image.cameras
         focal = camera.intrinsics[0, 0, 0]
         scale = float(pose.scale)
-        white = torch.ones_like(image.rgb_premultiplied[..., 0])
-        alpha = white if image.alpha is None else image.alpha
-        planes = [image.rgb_premultiplied, alpha[..., None], _edge_distances(image)[..., None]]
+        rgba = image_planes(image)
+        planes = torch.cat([rgba, _edge_distances(rgba[3])[None]])
         scaffolds = [_posed_vertices(person, pose, height) for height in person.heights]
         normals = normalize(_at_texels(person, mesh_normals(scaffolds[0], faces)), dim=1)
         offsets.append(normals @ pose.rotations[0])
@@ -221,7 +227,7 @@ def observe_texels(person: AtlasPerson, images: Iterable[tuple[Image, BodyPose]]
             at, depth, in_frame = project_points(world, camera)
             to_camera = normalize(camera.centers[0] - world, dim=1)
             cosine = (to_camera * normals).sum(1)
-            sampled = _sampled(torch.cat(planes, dim=-1), at) * in_frame[:, None]
+            sampled = _sampled(planes, at) * in_frame[:, None]
             covered = sampled[:, 3]
             # On slanted surfaces, pixels around a texel show points that are nearer by the pixel
             # width over the cosine.
@@ -267,22 +273,15 @@ def from_atlas(atlas: Tensor, texels: Texels) -> Tensor:
     return atlas.flatten(1).index_select(1, texels.index).T
 
 
-def _edge_distances(image: Image) -> Tensor:
-    """Return signed distances (H, W) to the silhouette edge, px, positive inside.
+def _edge_distances(alpha: Tensor) -> Tensor:
+    """Return signed distances (H, W) to the edge of a silhouette (H, W), px, positive inside.
 
     At the edge they are alpha - 0.5, which is exact for a vertical edge.
     """
-    if image.alpha is None:
-        return torch.full_like(
-            image.rgb_premultiplied[..., 0], float(max(image.rgb_premultiplied.shape))
-        )
-    alpha = image.alpha.double().cpu().numpy()
-    is_inside = np.pad(alpha > 0.5, 1)
-    to_edge = [np.asarray(distance_transform_edt(x))[1:-1, 1:-1] for x in (is_inside, ~is_inside)]
-    signed = to_edge[0] - to_edge[1]
-    signed -= np.sign(signed) / 2
-    signed = np.where(np.abs(signed) <= 0.5, alpha - 0.5, signed)
-    return torch.from_numpy(signed).to(image.rgb_premultiplied)
+    is_inside = np.pad((alpha > 0.5).cpu().numpy(), 1)
+    inside, outside = (np.asarray(distance_transform_edt(x)) for x in (is_inside, ~is_inside))
+    signed = torch.from_numpy((inside - outside)[1:-1, 1:-1]).to(alpha)
+    return torch.where(signed.abs() > 1, signed - signed.sign() / 2, alpha - 0.5)
 
 
 def _nearest_depth(vertices: Tensor, faces: Tensor, camera: Cameras, at: Tensor) -> Tensor:
@@ -290,16 +289,14 @@ def _nearest_depth(vertices: Tensor, faces: Tensor, camera: Cameras, at: Tensor)
     outside."""
     depth = depths(vertices, faces, camera)
     # The minimum of 2 x 2 pixels, infinite beyond the image.
-    least = -max_pool2d(-pad(depth, (1, 1, 1, 1), value=torch.inf)[None], 2, 1)[0]
-    return _sampled(least[..., None], at + 0.5, "nearest")[:, 0]
+    least = -max_pool2d(-pad(depth, (1, 1, 1, 1), value=torch.inf)[None], 2, 1)
+    return _sampled(least, at + 0.5, "nearest")[:, 0]
 
 
-def _sampled(image: Tensor, at: Tensor, mode: str = "bilinear") -> Tensor:
-    """Sample an image (H, W, D) at columns and rows ``at`` (P, 2); return (P, D)."""
-    grid = 2 * at / at.new_tensor(image.shape[1::-1]) - 1
-    grid = grid.nan_to_num().clamp(-2, 2)[None, None]
-    planes = image.permute(2, 0, 1)[None]
-    return grid_sample(planes, grid, mode, "border", align_corners=False)[0, :, 0].T
+def _sampled(planes: Tensor, at: Tensor, mode: str = "bilinear") -> Tensor:
+    """Sample planes (D, H, W) at columns and rows ``at`` (P, 2); return (P, D)."""
+    grid = 2 * at / at.new_tensor(planes.shape[:0:-1]) - 1
+    return sample_maps(planes[None], grid[None], mode, "border")[0]
 
 
 def _at_texels(person: AtlasPerson, values: Tensor) -> Tensor:

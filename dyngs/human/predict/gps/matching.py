@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, instance_norm, interpolate, max_pool2d, pad, unfold
 
-from dyngs.human.predict.gps.rectification import RectifiedPair
+from dyngs.human.predict.gps.rectification import SIDES, RectifiedPair
 from dyngs.models.prediction import GROUPS, ResidualBlock, upsample
 
 QUARTER = 4
@@ -31,8 +31,6 @@ front of it at a distance of 2 m."""
 _COLOUR, _BESIDE = 300.0, 5.0  # factors of colour difference and background in the offset logits
 _SHARPNESS = 2.0  # of upsampling weights, which fall with the squared distance
 _NEVER = -1e4  # logit of excluded values
-SIDES = (1.0, -1.0)
-"""Direction of a match's motion with its offset: left in the right view, right in the left."""
 
 
 class CostVolumeNetwork(nn.Module):

@@ -13,20 +13,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations, pairwise
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import grid_sample
+from torch.nn.functional import grid_sample, normalize, pad
 
-from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
 from dyngs.data.capture import View
 from dyngs.data.geometry import camera_center
 from dyngs.data.loader import Image
+from dyngs.human.avatar.observations import project_points
+from dyngs.human.predict.people import image_planes, sample_maps
 
 MIN_ANGLE, MAX_ANGLE = 5.0, 50.0
 """Allowed angle between the view axes of a pair, degrees; 45 in the paper."""
@@ -43,8 +44,8 @@ def neighbour_pairs(
     Raises DyngsError, for the capture ``name``: a view without a suitable neighbour.
     """
     ordered = order_around_person(views, chosen)
-    steps = [*pairwise(ordered), *([(ordered[-1], ordered[0])] if len(ordered) > 2 else [])]
-    pairs = [pair for step in steps if (pair := order_as_pair(views, *step)) is not None]
+    found = [order_as_pair(views, *step) for step in pairwise([*ordered, ordered[0]])]
+    pairs = [pair for pair in dict.fromkeys(found) if pair is not None]
     alone = set(chosen) - {i for pair in pairs for i in pair}
     if alone:
         raise DyngsError(
@@ -61,14 +62,13 @@ def order_as_pair(views: Sequence[View], one: int, other: int) -> tuple[int, int
     second = views[other]
     line = camera_center(second.cam_from_world) - camera_center(first.cam_from_world)
     across = first.cam_from_world[0, :3] + second.cam_from_world[0, :3]
-    along = line @ across
-    is_level = along and abs(along) >= _MIN_LEVEL_COSINE * np.linalg.norm(line) * np.linalg.norm(
-        across
-    )
+    lengths = np.linalg.norm(line) * np.linalg.norm(across)
+    cosine = line @ across / max(lengths, 1e-12)
     is_near = MIN_ANGLE <= angle_between_views(first, second) <= MAX_ANGLE
+    is_level = abs(cosine) >= _MIN_LEVEL_COSINE
     if not is_level or not is_near or (first.frame, first.time) != (second.frame, second.time):
         return None
-    return (one, other) if along > 0 else (other, one)
+    return (one, other) if cosine > 0 else (other, one)
 
 
 def angle_between_views(one: View, other: View) -> float:
@@ -88,12 +88,12 @@ def order_around_person(views: Sequence[View], chosen: Sequence[int]) -> list[in
     return [chosen[i] for i in np.argsort(azimuth, kind="stable")]
 
 
-def views_by_time(views: Sequence[View]) -> dict[tuple[int | None, float | None], list[int]]:
+def rings_of_views(views: Sequence[View]) -> list[list[int]]:
     """Return the views of each time step, in their order around the person."""
-    groups: dict[tuple[int | None, float | None], list[int]] = {}
+    groups: dict[Any, list[int]] = {}
     for i, view in enumerate(views):
         groups.setdefault((view.frame, view.time), []).append(i)
-    return {time: order_around_person(views, group) for time, group in groups.items()}
+    return [order_around_person(views, group) for group in groups.values()]
 
 
 def spread(ring: Sequence[int], count: int, first: int = 0) -> list[int]:
@@ -103,28 +103,27 @@ def spread(ring: Sequence[int], count: int, first: int = 0) -> list[int]:
 
 def spread_around_person(views: Sequence[View], count: int) -> list[int]:
     """Return ``count`` views, evenly around the person, of the time step with the most views."""
-    ring = max(views_by_time(views).values(), key=len)
+    ring = max(rings_of_views(views), key=len)
     return sorted(set(spread(ring, count)))
 
 
 def best_pair(views: Sequence[View]) -> list[int]:
     """Return the best stereo pair of the time step with the most views."""
-    ring = max(views_by_time(views).values(), key=len)
+    ring = max(rings_of_views(views), key=len)
+
+    def deviation(pair: tuple[int, int]) -> float:
+        one, other = pair
+        return abs(angle_between_views(views[one], views[other]) - _BEST_ANGLE)
+
     pairs = [pair for pair in combinations(ring, 2) if order_as_pair(views, *pair) is not None]
-    return list(
-        min(
-            pairs,
-            key=lambda pair: abs(angle_between_views(views[pair[0]], views[pair[1]]) - _BEST_ANGLE),
-            default=ring[:2],
-        )
-    )
+    return list(min(pairs, key=deviation, default=ring[:2]))
 
 
 def training_pairs(views: Sequence[View]) -> list[tuple[tuple[int, int], list[int]]]:
     """Return all training pairs, each with the views between its two, of which there is at least
     one."""
     pairs = []
-    for ring in views_by_time(views).values():
+    for ring in rings_of_views(views):
         for start, first in enumerate(ring):
             for step in range(2, len(ring)):
                 last = ring[(start + step) % len(ring)]
@@ -137,6 +136,8 @@ def training_pairs(views: Sequence[View]) -> list[tuple[tuple[int, int], list[in
     return pairs
 
 
+SIDES = (1.0, -1.0)
+"""Direction of a match's motion with its offset: left in the right view, right in the left."""
 SIZE_MULTIPLE = 16
 """Sides of crops are multiples of this, px."""
 MIN_ALPHA = 0.5  # alpha from which a pixel belongs to the person
@@ -188,24 +189,19 @@ class RectifiedPair:
         units."""
         return self.focal * self.baseline / (self.shift + offsets)
 
-    def alpha_in_other_view(self, offsets: Tensor) -> Tensor:
-        """Return the alpha (2, 1, H, W) of the other crop at the match of each pixel;
-        differentiable."""
-        return self.in_other_view(self.alpha, offsets)
-
     def in_other_view(self, layers: Tensor, offsets: Tensor) -> Tensor:
         """Return ``layers`` (2, D, H, W) of the other crop at the match of each pixel, bilinear; 0
-        outside."""
-        height, width = offsets.shape[2:]
-        sides = offsets.new_tensor([1.0, -1.0])[:, None, None]
-        column = torch.arange(width, device=offsets.device) + 0.5 - sides * offsets[:, 0]
-        row = (torch.arange(height, device=offsets.device) + 0.5)[:, None].expand_as(column)
-        grid = torch.stack([2 * column / width - 1, 2 * row / height - 1], dim=-1)
+        outside; differentiable."""
+        size = offsets.shape[2:]
+        sides = offsets.new_tensor(SIDES)[:, None, None, None]
+        moved = pad(sides * offsets[:, 0, ..., None], (0, 1))  # along the rows
+        matches = _pixel_centres(size, offsets) - moved
+        grid = 2 * matches / offsets.new_tensor(size[::-1]) - 1
         return grid_sample(layers.flip(0), grid, align_corners=False)
 
     def points(self, depth: Tensor) -> Tensor:
         """Return world points (2, H, W, 3) of all pixels at ``depth`` (2, 1, H, W)."""
-        rays = _rays(self.principal, self.focal, (depth.shape[2], depth.shape[3]))
+        rays = _rays(self.principal, self.focal, depth.shape[2:])
         return (depth[:, 0, ..., None] * rays) @ self.rect_from_world + self.centers[:, None, None]
 
 
@@ -215,11 +211,11 @@ def rectify_views(left: Image, right: Image, person_px: int) -> RectifiedPair:
     Raises DyngsError: no silhouettes, or the silhouettes do not match the cameras.
     """
     images = [_at_size(image, person_px) for image in (left, right)]
-    poses = [image.cameras.cam_from_world[0].double() for image in images]
-    centers = torch.stack([-pose[:3, :3].T @ pose[:3, 3] for pose in poses])
-    across = torch.nn.functional.normalize(centers[1] - centers[0], dim=0)
-    forward = poses[0][2, :3] + poses[1][2, :3]
-    down = torch.nn.functional.normalize(torch.linalg.cross(forward, across), dim=0)
+    poses = torch.cat([image.cameras.cam_from_world for image in images]).double()
+    centers = -(poses[:, :3, :3].mT @ poses[:, :3, 3:])[..., 0]
+    across = normalize(centers[1] - centers[0], dim=0)
+    forward = poses[:, 2, :3].sum(0)
+    down = normalize(torch.linalg.cross(forward, across), dim=0)
     rotation = torch.stack([across, down, torch.linalg.cross(across, down)])
     boxes = torch.stack([_box(image, rotation) for image in images])
     widths, heights = (boxes[..., 1] - boxes[..., 0]).amax(0).tolist()
@@ -287,15 +283,12 @@ def _window(image: Image, rotation: Tensor, rays: Tensor) -> tuple[Tensor, Tenso
     projected = directions @ camera.intrinsics[0].double().T
     size = projected.new_tensor([camera.width, camera.height])
     grid = (2 * projected[..., :2] / projected[..., 2:] / size - 1).float()[None]
-    assert image.alpha is not None
-    layers = torch.cat([image.rgb_premultiplied, image.alpha[..., None]], dim=2)
-    layers = layers.permute(2, 0, 1)[None]
-    sampled = grid_sample(layers, grid, align_corners=False)[0]
-    rgb = sampled[:3] / sampled[3:].clamp_min(1e-3)
+    sampled = grid_sample(image_planes(image)[None], grid, align_corners=False)[0]
+    alpha = sampled[3:]
+    rgb = (sampled[:3] / alpha.clamp_min(1e-3)).clamp(0, 1)
     if image.depth is None:
-        return rgb.clamp(0, 1), sampled[3:], torch.full_like(sampled[3:], torch.nan)
-    depth = _depth_at(image.depth, grid) / directions[None, ..., 2].float()
-    return rgb.clamp(0, 1), sampled[3:], depth
+        return rgb, alpha, torch.full_like(alpha, torch.nan)
+    return rgb, alpha, _depth_at(image.depth, grid) / directions[None, ..., 2].float()
 
 
 def _depth_at(depth: Tensor, grid: Tensor) -> Tensor:
@@ -313,50 +306,23 @@ def _depth_at(depth: Tensor, grid: Tensor) -> Tensor:
     return torch.where(nearest[1:] > 0, 1 / inverse, torch.nan)
 
 
-def _rays(principal: Tensor, focal: float, size: tuple[int, int]) -> Tensor:
+def _rays(principal: Tensor, focal: float, size: Sequence[int]) -> Tensor:
     """Return the rays (2, H, W, 3) through the pixels of the crops, at depth 1."""
-    pixels = (torch.arange(n, dtype=principal.dtype, device=principal.device) for n in size)
-    rows, columns = (x + 0.5 for x in pixels)
-    y = ((rows - principal[:, 1:]) / focal)[:, :, None].expand(-1, -1, size[1])
-    x = ((columns - principal[:, :1]) / focal)[:, None].expand(-1, size[0], -1)
-    return torch.stack([x, y, torch.ones_like(x)], dim=-1)
+    flat = (_pixel_centres(size, principal) - principal[:, None, None]) / focal
+    return pad(flat, (0, 1), value=1.0)
+
+
+def _pixel_centres(size: Sequence[int], like: Tensor) -> Tensor:
+    """Return columns and rows (H, W, 2) of the centres of H x W pixels."""
+    rows, columns = (torch.arange(side).to(like) + 0.5 for side in size)
+    return torch.stack(torch.meshgrid(columns, rows, indexing="xy"), dim=-1)
 
 
 def is_inside(image: Image, points: Tensor) -> Tensor:
     """Return the points (N,) bool that an image shows as the person, or that lie outside the
     image."""
-    assert image.alpha is not None
-    camera = image.cameras
-    pose = camera.cam_from_world[0]
-    flat = (points @ pose[:3, :3].T + pose[:3, 3]) @ camera.intrinsics[0].T
-    size = flat.new_tensor([camera.width, camera.height])
-    position = flat[:, :2] / flat[:, 2:].clamp_min(1e-9) / size
-    is_outside = (flat[:, 2] <= 0) | ((position < 0) | (position > 1)).any(1)
-    grid = (2 * position - 1)[None, None]
-    alpha = grid_sample(image.alpha[None, None], grid, align_corners=False)[0, 0, 0]
-    return is_outside | (alpha > _MIN_OUTLINE_ALPHA)
-
-
-def crop_to_person(image: Image, margin: int) -> Image:
-    """Crop an image to its visible part plus ``margin`` px, with its camera."""
-    assert image.alpha is not None
-    visible = (image.alpha > 0).nonzero()
-    if not len(visible):
-        return image
-    top, left = (visible.amin(0) - margin).clamp_min(0).tolist()
-    bottom, right = (visible.amax(0) + 1 + margin).tolist()
-    return crop_image(image, top, left, bottom - top, right - left)
-
-
-def crop_image(image: Image, top: int, left: int, height: int, width: int) -> Image:
-    """Crop an image at a row and column, with its camera and maps; smaller where the image ends."""
-    tensors: Any = {
-        name: x[top : top + height, left : left + width].contiguous()
-        for name, x in image.tensors().items()
-    }
-    camera = image.cameras
-    intrinsics = camera.intrinsics.clone()
-    intrinsics[:, :2, 2] -= intrinsics.new_tensor([left, top])
-    height, width = tensors["rgb_premultiplied"].shape[:2]
-    cameras = Cameras(camera.cam_from_world, intrinsics, width, height)
-    return replace(image, cameras=cameras, **tensors)
+    planes = image_planes(image)
+    pixels, _, in_frame = project_points(points, image.cameras)
+    grid = 2 * pixels / pixels.new_tensor(planes.shape[:0:-1]) - 1
+    alpha = sample_maps(planes[None, 3:], grid[None])[0, :, 0]
+    return ~in_frame | (alpha > _MIN_OUTLINE_ALPHA)

@@ -36,13 +36,13 @@ from dyngs.human.predict.gps.rectification import (
     MAX_ANGLE,
     RectifiedPair,
     best_pair,
-    crop_to_person,
     is_inside,
     neighbour_pairs,
     rectify_views,
     spread_around_person,
     training_pairs,
 )
+from dyngs.human.predict.people import crop_to_person
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.prediction import (
     CaptureLearner,
@@ -145,7 +145,7 @@ def surface_gaussians_of_pair(pair: RectifiedPair, offsets: Tensor, raw: Tensor)
     part = dict(zip(HEADS, parts, strict=True))
     pixel = (depth[:, 0][solid] / pair.focal)[:, None]
     scales = LARGEST * pixel * (part["scale"] + _SCALE_LOGIT).sigmoid()
-    within = (pair.alpha * pair.alpha_in_other_view(offsets))[solid[:, None]]
+    within = (pair.alpha * pair.in_other_view(pair.alpha, offsets))[solid[:, None]]
     opacities = (part["opacity"][:, 0] + _OPACITY_LOGIT).sigmoid() * within
     opacities = opacities.clamp(1e-4, 1 - 1e-4)
     one = part["rotation"].new_tensor([1.0, 0.0, 0.0, 0.0])

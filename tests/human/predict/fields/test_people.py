@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from dyngs.human.avatar.observations import project_points
-from dyngs.human.predict.gps.rectification import spread, views_by_time
+from dyngs.human.predict.gps.rectification import rings_of_views, spread
 from dyngs.human.predict.people import (
     Person,
     cameras_in_metres,
@@ -69,14 +69,14 @@ def test_sources_are_the_images_around_the_person(person: Person) -> None:
 
 def test_views_are_spread_around_a_moment(person: Person) -> None:
     views = person.views
-    (ring,) = views_by_time(views).values()
+    (ring,) = rings_of_views(views)
     assert sorted(ring) == list(range(len(views)))
     angles = np.unwrap([np.arctan2(*views[i].cam_from_world[2, [0, 2]]) for i in ring])
     assert (np.diff(angles) > 0).all() or (np.diff(angles) < 0).all()
     assert spread(range(12), 4) == [0, 3, 6, 9]
     assert spread(range(12), 3, 11) == [11, 3, 7]
     later = [replace(view, frame=1, time=0.5) if i % 2 else view for i, view in enumerate(views)]
-    assert [len(x) for x in views_by_time(later).values()] == [
+    assert [len(x) for x in rings_of_views(later)] == [
         (len(views) + 1) // 2,
         len(views) // 2,
     ]

@@ -11,7 +11,6 @@ from dyngs.human.predict.gps.matching import (
     NUM_OFFSETS,
     QUARTER,
     RADIUS,
-    SIDES,
     CostVolumeNetwork,
     RecurrentNetwork,
     candidate_offsets,
@@ -20,7 +19,7 @@ from dyngs.human.predict.gps.matching import (
     look_up,
     plane_sweep_costs,
 )
-from dyngs.human.predict.gps.rectification import RectifiedPair
+from dyngs.human.predict.gps.rectification import SIDES, RectifiedPair
 from dyngs.human.predict.gps.stereo import GpsNetwork, end_point_error, offset_loss
 from dyngs.human.predict.keys import GpsModel
 from dyngs.models.prediction import Encoder

@@ -12,7 +12,8 @@ from ray_traced_ball import CENTER, RADIUS, SIZE, ball, exact_depth, pose_at
 
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
-from dyngs.human.predict.gps.rectification import RectifiedPair, crop_to_person, rectify_views
+from dyngs.human.predict.gps.rectification import RectifiedPair, rectify_views
+from dyngs.human.predict.people import crop_to_person
 
 
 @pytest.fixture(params=[(0, 30, 0.0, 0.0), (-10, 35, 0.15, 4.0), (170, 192, -0.1, -3.0)])

@@ -30,7 +30,7 @@ def test_true_offsets_put_gaussians_on_the_surface(pair: RectifiedPair) -> None:
     found = surface_gaussians_of_pair(pair, offsets, raw)
     assert len(found) == int(pair.solid.sum())
     inner = (pair.alpha[pair.solid] > 0.999) & (
-        pair.alpha_in_other_view(offsets)[pair.solid] > 0.999
+        pair.in_other_view(pair.alpha, offsets)[pair.solid] > 0.999
     )
     assert found.opacities[inner].min() > 0.85
     assert ((found.means - CENTER).norm(dim=1) - RADIUS)[inner].abs().max() < 1e-4
@@ -51,7 +51,7 @@ def test_surfaces_unseen_by_the_other_view_are_transparent(pair: RectifiedPair) 
     )
     known = pair.alpha[pair.solid] > 0.999
     assert right[known].mean() > 0.8
-    beside = pair.alpha_in_other_view(offsets + 15.0)[pair.solid] == 0
+    beside = pair.in_other_view(pair.alpha, offsets + 15.0)[pair.solid] == 0
     assert 0.1 < beside.float().mean() < 0.9
     assert wrong[beside].max() < 1e-3
 
