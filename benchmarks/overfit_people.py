@@ -53,16 +53,8 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "preset": (),
     "between": ("model.training_views=between",),
     "rays": ("model.training_views=between", "model.supersampling=2"),
-    "laplace": ("model.training_views=between", "model.supersampling=2", "model.density=laplace"),
-    "weighted": (
-        "model.training_views=between",
-        "model.supersampling=2",
-        "model.hidden_views=weighted",
-    ),
-    "plain": ("model.training_views=between", "model.supersampling=2", "model.refine=false"),
 }
-"""Overrides of the presets; the last three are of eg_human_nerf alone."""
-EG_VARIANTS = ("laplace", "weighted", "plain")
+"""Overrides of the presets."""
 FAR = 1e3  # depth of the background, m
 TOLERANCE = 0.02  # of the test whether an image shows a point, m
 
@@ -169,8 +161,6 @@ def main() -> None:
     runs = []
     for kind in given.kinds:
         for name in given.variants:
-            if name in EG_VARIANTS and kind != "eg_human_nerf":
-                continue
             run = given.out / "runs" / f"{kind}-{name}"
             words = [f"data.root={people}", f"run.dir={run}", "run.threads=1"]
             words.append(f"train.steps={given.steps}")

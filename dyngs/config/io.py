@@ -75,6 +75,7 @@ RENAMED_KEYS = {"model.choose": "model.pilot_runs", "init.trains": "init.trainab
 former name are refused."""
 _WERE_AUTO = (("camera", "refine"), ("train", "exposure"), ("train", "robust"))
 """Sections and keys with the former value "auto", in requested configurations only."""
+_REMOVED_FIELD_KEYS = {"density": "neus", "hidden_views": "excluded", "refine": True}
 REMOVED_MODEL_KEYS: dict[str, dict[str, object]] = {
     "human": {
         "refine_from": 0.1,
@@ -100,7 +101,9 @@ REMOVED_MODEL_KEYS: dict[str, dict[str, object]] = {
         "srdf_weight": 0.2,
         "boundaries": True,
         "visibility": True,
+        **_REMOVED_FIELD_KEYS,
     },
+    "predicted_field": _REMOVED_FIELD_KEYS,
 }
 """``REMOVED_KEYS`` of the section ``model``, by kind of model."""
 _FOLLOW_LINKS = ("data", "follow_links")

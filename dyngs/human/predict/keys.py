@@ -10,7 +10,7 @@ from pydantic import Field
 from dyngs.core.section import Fraction, ModelSection, Positive, SceneModel
 
 
-class _FieldKeys(ModelSection):
+class FieldKeys(ModelSection):
     """Keys that decide how a field of a person is rendered."""
 
     supersampling: int = Field(
@@ -21,25 +21,7 @@ class _FieldKeys(ModelSection):
     )
 
 
-class EgHumanNerfKeys(_FieldKeys):
-    """Keys that decide how an EG-HumanNeRF field is rendered."""
-
-    density: Literal["neus", "laplace"] = Field(
-        default="neus",
-        description="eg_human_nerf: opacity from signed ray distances; neus: differences of a "
-        "sigmoid, laplace: density from the Laplace distribution function",
-    )
-    hidden_views: Literal["excluded", "weighted"] = Field(
-        default="excluded",
-        description="eg_human_nerf: images in which the body hides a sample; excluded: not used "
-        "where others show it, weighted: the attention weights them by the depth behind the body",
-    )
-    refine: bool = Field(
-        default=True, description="eg_human_nerf: a U-Net corrects the rendered image"
-    )
-
-
-class FieldPredictorModel(_FieldKeys):
+class FieldPredictorModel(FieldKeys):
     """Keys of networks that predict a radiance field of a person."""
 
     body: Path | None = Field(
@@ -76,7 +58,7 @@ class KeypointNerfModel(FieldPredictorModel):
     )
 
 
-class EgHumanNerfModel(FieldPredictorModel, EgHumanNerfKeys):
+class EgHumanNerfModel(FieldPredictorModel):
     """EG-HumanNeRF (Wang, Kanamori and Endo 2024)."""
 
     kind: Literal["eg_human_nerf"] = Field(
@@ -86,7 +68,7 @@ class EgHumanNerfModel(FieldPredictorModel, EgHumanNerfKeys):
     )
 
 
-class PredictedFieldModel(EgHumanNerfKeys):
+class PredictedFieldModel(FieldKeys):
     """Radiance field predicted by such a network; it is rendered but not trained."""
 
     kind: Literal["predicted_field"] = Field(

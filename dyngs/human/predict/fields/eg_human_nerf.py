@@ -38,7 +38,7 @@ from dyngs.human.predict.fields.network import (
     sample_offsets,
     view_weights,
 )
-from dyngs.human.predict.keys import EgHumanNerfKeys
+from dyngs.human.predict.keys import FieldKeys
 from dyngs.human.predict.people import DILATION, sample_maps
 from dyngs.models.volume import camera_rays
 from dyngs.ops.rays import Rays
@@ -73,7 +73,7 @@ class EgHumanNerf(FieldNetwork):
 
     needs_depth = True
 
-    def __init__(self, generator: torch.Generator, keys: EgHumanNerfKeys) -> None:
+    def __init__(self, generator: torch.Generator, keys: FieldKeys) -> None:
         super().__init__(PARAMS.features, keys)
         width = PARAMS.width
         pixel = PARAMS.features + FINE
@@ -83,7 +83,7 @@ class EgHumanNerf(FieldNetwork):
         colours = 3 + FINE
         self.blend = Perceptron(3 * colours + PARAMS.geometry + 5, width, width // 2, 1)
         self.sharpness = nn.Parameter(torch.tensor(math.log(PARAMS.sharpness), device="cpu"))
-        self.refine = Refinement() if self.keys.refine else None
+        self.refine = Refinement()
         initialize_network(self, generator)
         with torch.no_grad():  # start with the body surface and unchanged colours
             for name, weight in self.named_parameters():
@@ -105,8 +105,6 @@ class EgHumanNerf(FieldNetwork):
         self, person: EncodedPerson, camera: Cameras, generator: torch.Generator | None = None
     ) -> FieldPicture:
         picture = super().render(person, camera, generator)
-        if self.refine is None:
-            return picture
         middle = float((person.body.key_points.mean(0) - camera.centers[0]).norm())
         colour = self.refine(picture.colour, picture.transmittance, picture.depth, middle)
         return replace(picture, colour=colour)
@@ -152,13 +150,9 @@ class EgHumanNerf(FieldNetwork):
         near = surface + at.new_tensor(PARAMS.offsets)
         points, seen, height = look_up(near)
         front = sample_maps(person.extra, seen.grid, "nearest")[..., 0]
-        behind = (seen.depth - front.where(seen.alpha > 0, _FAR)) / PARAMS.hidden_by
-        hidden = behind > 1
+        hidden = seen.depth - front.where(seen.alpha > 0, _FAR) > PARAMS.hidden_by
         # Images in which the sample is hidden, unless it is hidden in all.
         excluded = 1e4 * (hidden & ~hidden.all(0))
-        if self.keys.hidden_views == "weighted":
-            hidden = behind.clamp(0, 2)
-            excluded = 0.0
         directions = rays.directions.repeat_interleave(near.shape[1], 0)
         relative = person.relative_directions(directions, points)
         facts = torch.cat([hidden[..., None].to(relative), relative], -1)
@@ -171,7 +165,7 @@ class EgHumanNerf(FieldNetwork):
         weights = view_weights(self.blend, [seen.colours, shared, facts], excluded)
         colours = mean_over_views(seen.rgb, weights).view(*near.shape, 3)
 
-        opacity = opacities(near, closer, self.sharpness.exp(), self.keys.density)
+        opacity = opacities(near, closer, self.sharpness.exp())
         through = pad((1 - opacity).cumprod(1), (1, 0), value=1.0)
         weights = -through.diff(dim=1)
         colour = (weights[..., None] * colours).sum(1)
@@ -230,21 +224,15 @@ def _neighbours(values: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
     return values.gather(1, index), values.gather(1, index + 1)
 
 
-def opacities(at: Tensor, signed: Tensor, sharpness: Tensor, form: str = "neus") -> Tensor:
+def opacities(at: Tensor, signed: Tensor, sharpness: Tensor) -> Tensor:
     """Return opacities (R, K) of signed ray distances (R, K) at (R, K).
 
-    Each sample covers half of the neighbouring intervals. ``form`` neus: differences of a sigmoid
-    (Wang et al. 2021) with cosine -1, since distances are along the ray. laplace: the density
-    alpha Psi(-s) with the Laplace distribution function Psi of scale beta (Yariv et al. 2021;
-    alpha = 1 / beta = ``sharpness``, per m).
+    Each sample covers half of the neighbouring intervals. Opacities are differences of a sigmoid
+    (NeuS, Wang et al. 2021) with cosine -1, since distances are along the ray.
     """
     gaps = at.diff(dim=1)
     gaps = torch.cat([gaps[:, :1], gaps, gaps[:, -1:]], 1)
     half = (gaps[:, :-1] + gaps[:, 1:]) / 4
-    if form == "laplace":
-        tail = (-sharpness * signed.abs()).exp() / 2
-        density = sharpness * torch.where(signed > 0, tail, 1 - tail)
-        return 1 - (-2 * half * density).exp()
     before = (sharpness * (signed + half)).sigmoid()
     behind = (sharpness * (signed - half)).sigmoid()
     return ((before - behind + 1e-5) / (before + 1e-5)).clamp(0, 1)

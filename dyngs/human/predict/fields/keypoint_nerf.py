@@ -34,7 +34,7 @@ from dyngs.human.predict.fields.network import (
     sample_offsets,
     view_weights,
 )
-from dyngs.human.predict.keys import EgHumanNerfKeys
+from dyngs.human.predict.keys import FieldKeys
 from dyngs.human.predict.people import NUM_KEY_POINTS, Sources, sample_maps
 from dyngs.models.volume import select_samples, visible_samples
 from dyngs.ops.rays import MarchSteps, Rays, Space, composite, march
@@ -67,7 +67,7 @@ HINTS = 4  # input features of a sample from bones and silhouettes
 class KeypointNerf(FieldNetwork):
     """KeypointNeRF network, see the module."""
 
-    def __init__(self, generator: torch.Generator, keys: EgHumanNerfKeys) -> None:
+    def __init__(self, generator: torch.Generator, keys: FieldKeys) -> None:
         super().__init__(PARAMS.features, keys)
         width = PARAMS.width
         colours = 3 + FINE + PARAMS.geometry

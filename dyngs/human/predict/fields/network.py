@@ -17,7 +17,7 @@ from torch.nn.functional import normalize
 
 from dyngs.core.camera import Cameras
 from dyngs.data.loader import Image
-from dyngs.human.predict.keys import EgHumanNerfKeys
+from dyngs.human.predict.keys import FieldKeys
 from dyngs.human.predict.people import PosedBody, Sources, sample_maps
 from dyngs.models.prediction import Encoder, initialize_weights, upsample
 from dyngs.models.volume import camera_rays
@@ -198,7 +198,7 @@ class FieldNetwork(nn.Module, ABC):
 
     needs_depth: ClassVar[bool] = False  # whether training needs depth maps
 
-    def __init__(self, features: int, keys: EgHumanNerfKeys) -> None:
+    def __init__(self, features: int, keys: FieldKeys) -> None:
         super().__init__()
         self.keys = keys
         self.encoder = ImageEncoder(features)

@@ -14,7 +14,7 @@ from dyngs.human.predict.fields.keypoint_nerf import (
     spatial_code,
 )
 from dyngs.human.predict.fields.network import EncodedPerson
-from dyngs.human.predict.keys import EgHumanNerfKeys
+from dyngs.human.predict.keys import FieldKeys
 from dyngs.human.predict.people import (
     Person,
     PosedBody,
@@ -27,7 +27,7 @@ from dyngs.human.predict.people import (
 
 @pytest.fixture(scope="module")
 def network() -> KeypointNerf:
-    return KeypointNerf(torch.Generator().manual_seed(0), EgHumanNerfKeys())
+    return KeypointNerf(torch.Generator().manual_seed(0), FieldKeys())
 
 
 def given(person: Person, views: tuple[int, ...] = (0, 2, 4)) -> tuple[Sources, PosedBody, float]:

@@ -65,7 +65,6 @@ def test_training_lowers_the_error(folder: Path, tmp_path: Path, kind: str) -> N
 
 
 ALTERNATIVES = {"training_views": "between", "patch": 12, "supersampling": 2}
-EG_ALTERNATIVES = {"density": "laplace", "hidden_views": "weighted", "refine": False}
 
 
 @pytest.fixture(scope="module")
@@ -76,15 +75,14 @@ def ring(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_other_keys_resume_predict_and_restore(ring: Path, tmp_path: Path, kind: str) -> None:
-    keys = ALTERNATIVES | (EG_ALTERNATIVES if kind == "eg_human_nerf" else {})
-    whole = train(field_config(kind, ring, tmp_path / kind, keys))
-    config = field_config(kind, ring, tmp_path / "parts", keys)
+    whole = train(field_config(kind, ring, tmp_path / kind, ALTERNATIVES))
+    config = field_config(kind, ring, tmp_path / "parts", ALTERNATIVES)
     resumed = train(config, resume_from=stopped(config, 2))
     assert checkpoint_paths(resumed)[-1].read_bytes() == checkpoint_paths(whole)[-1].read_bytes()
     made = predict(whole, ring / "s0000" / "p000000", tmp_path / "two", 2)
     found = load_run(made.run_dir)
     assert isinstance(found.renderable, PredictedField)
-    for name, value in keys.items():
+    for name, value in ALTERNATIVES.items():
         if name in type(found.config.model).model_fields:
             assert getattr(found.config.model, name) == value
             assert getattr(found.renderable.network.keys, name) == value
