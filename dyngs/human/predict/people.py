@@ -143,7 +143,7 @@ class Person:
     def views(self) -> tuple[View, ...]:
         return self.images.views
 
-    def pose_in(self, view: View) -> BodyPose:
+    def pose_in(self, view: View | Image) -> BodyPose:
         row = self.motion.rows[-1 if view.frame is None else view.frame]
         return frame_pose(self.motion.clip, row)
 

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
+from statistics import mode
 from typing import Any
 
 import numpy as np
@@ -29,11 +30,11 @@ from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.core.state import move_fields_to
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.capture import View
+from dyngs.data.geometry import camera_center
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import list_captures, read_capture
 from dyngs.gaussians import Gaussians
-from dyngs.gaussians.colour.network import RestPose
-from dyngs.gaussians.scene import GaussianTimeStep, render_options
+from dyngs.gaussians.scene import render_options
 from dyngs.gaussians.schedule import RateSchedule
 from dyngs.human.avatar.observations import FACING_EXPONENT, project_points
 from dyngs.human.avatar.posing import BodyPose, Skeleton, pose_blend_shapes, texel_gaussians
@@ -117,10 +118,10 @@ def spread_views(person: AtlasPerson, count: int, first: int | None = None) -> l
     """
     views = person.person.views
     frames = [view.frame for view in views]
-    frame = max(dict.fromkeys(frames), key=frames.count) if first is None else frames[first]
-    candidates = [i for i, frame_of_view in enumerate(frames) if frame_of_view == frame]
+    frame = mode(frames) if first is None else frames[first]
+    candidates: Sequence[int] = [i for i, other in enumerate(frames) if other == frame]
     if len(candidates) < count:
-        candidates = list(range(len(views)))
+        candidates = range(len(views))
     azimuths = {i: _azimuth(person, views[i]) for i in candidates}
     ring = sorted(candidates, key=lambda i: azimuths[i])
     if first is None:
@@ -131,8 +132,7 @@ def spread_views(person: AtlasPerson, count: int, first: int | None = None) -> l
 def _azimuth(person: AtlasPerson, view: View) -> float:
     """Return the azimuth of a camera around the body, rad; 0 is in front."""
     pose = person.person.pose_in(view)
-    cam_from_world = torch.from_numpy(view.cam_from_world).to(pose.trans)
-    center = -cam_from_world[:3, :3].T @ cam_from_world[:3, 3]
+    center = torch.from_numpy(camera_center(view.cam_from_world)).to(pose.trans)
     pelvis = pose.scale * person.scene.skeleton.joints[0] + pose.trans
     x, _, z = pose.rotations[0].T @ (center - pelvis)
     return float(torch.atan2(x, z))
@@ -158,23 +158,18 @@ def fill_unseen_colours(texels: Texels, rgb: Tensor, seen: Tensor) -> Tensor:
     Weights fall with the squared distance, which includes the normal, and grow with the viewing
     cosine. 0.5 if nothing is observed.
     """
-    is_seen = (seen > 0).cpu().numpy()
-    if not is_seen.any():
+    observed = (seen > 0).nonzero()[:, 0]
+    hidden = (seen <= 0).nonzero()[:, 0]
+    if not len(observed):
         return torch.full_like(rgb, _UNKNOWN)
-    if is_seen.all():
-        return rgb
     positions = _positions(texels)
-    observed = np.flatnonzero(is_seen)
     # SciPy drops the axis of a single neighbour unless its rank is given.
     ranks: Any = np.arange(min(_NEAREST, len(observed))) + 1
-    distance, near = KDTree(positions[observed]).query(positions[~is_seen], k=ranks)
-    rows = torch.from_numpy(observed[near]).to(rgb.device)
-    weight = seen[rows] / (torch.from_numpy(distance).to(rgb) + _SOFT_DISTANCE).square()
-    filled = rgb.clone()
-    filled[torch.from_numpy(~is_seen).to(rgb.device)] = (weight[..., None] * rgb[rows]).sum(
-        1
-    ) / weight.sum(1)[:, None]
-    return filled
+    search = KDTree(positions[observed.cpu()])
+    distance, near = (torch.from_numpy(x) for x in search.query(positions[hidden.cpu()], k=ranks))
+    rows = observed[near.to(observed.device)]
+    weight = (seen[rows] / (distance.to(rgb) + _SOFT_DISTANCE).square())[..., None]
+    return rgb.index_copy(0, hidden, (weight * rgb[rows]).sum(1) / weight.sum(1))
 
 
 def _positions(texels: Texels) -> np.ndarray:
@@ -206,57 +201,53 @@ class TexelMaps:
 @torch.no_grad()
 def observe_texels(person: AtlasPerson, images: Iterable[tuple[Image, BodyPose]]) -> TexelMaps:
     """Collect the texel maps of one or more images, each with its body pose."""
-    shape = (len(person.heights), len(person.texels))
-    device = person.texels.points.device
     faces = person.person.body.faces
-    colour = torch.zeros(*shape, 3, device=device)
-    weight, seen, inside, in_frames = (torch.zeros(shape, device=device) for _ in range(4))
-    silhouette_distance = torch.full(shape, MAX_SILHOUETTE_DISTANCE, device=device)
     offsets: list[Tensor] = []
+    observed = []
     for image, pose in images:
         camera = image.cameras
         focal = camera.intrinsics[0, 0, 0]
-        scale = float(pose.scale)
         rgba = image_planes(image)
         planes = torch.cat([rgba, _edge_distances(rgba[3])[None]])
         scaffolds = [_posed_vertices(person, pose, height) for height in person.heights]
         normals = normalize(_at_texels(person, mesh_normals(scaffolds[0], faces)), dim=1)
         offsets.append(normals @ pose.rotations[0])
-        for level, vertices in enumerate(scaffolds):
+        for vertices in scaffolds:
             world = _at_texels(person, vertices)
             at, depth, in_frame = project_points(world, camera)
             to_camera = normalize(camera.centers[0] - world, dim=1)
             cosine = (to_camera * normals).sum(1)
             sampled = _sampled(planes, at) * in_frame[:, None]
             covered = sampled[:, 3]
+            pixel = depth / focal
             # On slanted surfaces, pixels around a texel show points that are nearer by the pixel
             # width over the cosine.
-            tolerance = scale * _TOLERANCE + _TOLERANCE_PX * depth / focal / cosine.clamp_min(
-                _MIN_COSINE
-            )
-            is_clear = depth <= _nearest_depth(vertices, faces, camera, at) + tolerance
-            is_seen = is_clear & in_frame & (cosine > _MIN_COSINE)
-            cosine = torch.where(is_seen, cosine, 0.0) * (covered > 0.5)
-            colour[level] += cosine[:, None] ** FACING_EXPONENT * sampled[:, :3]
-            weight[level] += cosine**FACING_EXPONENT * covered
-            seen[level] = torch.maximum(seen[level], cosine)
-            inside[level] += (covered > 0.5).float()
-            in_frames[level] += in_frame.float()
+            slanted = pixel / cosine.clamp_min(_MIN_COSINE)
+            nearest = _nearest_depth(vertices, faces, camera, at)
+            is_clear = depth <= nearest + pose.scale * _TOLERANCE + _TOLERANCE_PX * slanted
+            is_seen = is_clear & in_frame & (cosine > _MIN_COSINE) & (covered > 0.5)
+            cosine = torch.where(is_seen, cosine, 0.0)
+            weight = cosine**FACING_EXPONENT
             # in metres of the body, for texels within the frame
             to_edge = torch.where(
-                in_frame, sampled[:, 4] * depth / focal / scale, MAX_SILHOUETTE_DISTANCE
+                in_frame, sampled[:, 4] * pixel / pose.scale, MAX_SILHOUETTE_DISTANCE
             )
-            silhouette_distance[level] = torch.minimum(silhouette_distance[level], to_edge)
-    rgb = (colour / weight.clamp_min(1e-6)[..., None]).clamp(0, 1)
+            one = [cosine, weight * covered, covered > 0.5, in_frame, to_edge]
+            colours = weight[:, None] * sampled[:, :3]
+            observed.append(torch.cat([colours, torch.stack(one, dim=1)], dim=1))
+    maps = torch.stack(observed).unflatten(0, (len(offsets), -1))  # (V, K, P, 8)
+    seen = maps[..., 3].amax(0)
+    to_edge = maps[..., 7].amin(0)
+    colour, _, weight, inside, in_frames, _ = maps.sum(0).split((3, 1, 1, 1, 1, 1), dim=-1)
+    rgb = (colour / weight.clamp_min(1e-6)).clamp(0, 1)
     fraction = torch.where(in_frames > 0, inside / in_frames.clamp_min(1), 1.0)
-    nearby = fill_unseen_colours(person.texels, rgb[0], seen[0])
     return TexelMaps(
         rgb,
         seen,
-        fraction,
-        silhouette_distance.clamp_min(-MAX_SILHOUETTE_DISTANCE),
+        fraction[..., 0],
+        to_edge.clamp(-MAX_SILHOUETTE_DISTANCE, MAX_SILHOUETTE_DISTANCE),
         offsets[0],
-        nearby,
+        fill_unseen_colours(person.texels, rgb[0], seen[0]),
         len(offsets),
     )
 
@@ -377,17 +368,16 @@ class AtlasNetwork(Encoder):
     the input.
     """
 
-    def __init__(
-        self, channels: int, scaffolds: int, generator: torch.Generator, inpaints: bool = False
-    ) -> None:
-        """Create the network on the CPU for D ``channels`` and K ``scaffolds``, with weights from
-        ``generator``; with one that ``inpaints``."""
+    def __init__(self, scaffolds: int, generator: torch.Generator, inpaints: bool = False) -> None:
+        """Create the network on the CPU for K ``scaffolds``, with weights from ``generator``; with
+        one that ``inpaints``."""
+        channels = 6 * scaffolds + 18  # of ``network_inputs``
         with torch.device("cpu"):
             super().__init__(channels, WIDTHS)
             self.scaffolds = scaffolds
             self.up = nn.ModuleList(
                 nn.Sequential(nn.Conv2d(below + width, width, 3, padding=1), ResidualBlock(width))
-                for below, width in zip(WIDTHS[:0:-1], WIDTHS[-2::-1], strict=True)
+                for below, width in pairwise(WIDTHS[::-1])
             )
             self.last = nn.Sequential(
                 nn.Conv2d(WIDTHS[0] + channels, WIDTHS[0], 3, padding=1), nn.SiLU()
@@ -412,11 +402,6 @@ _MAX_LOG_SCALE = 1.5  # limit on the change of log scales from the initial Gauss
 _IMAGE_LOGIT = 4.0  # initial logit of image colours against predicted colours
 _GUESS_LOGITS = (0.0, 2.0, 0.0)  # initial logits of the three colours of ``guess_unseen_colours``
 _MAX_HEIGHT = 0.01  # limit on offsets along the normal with a single scaffold, m
-
-
-def num_input_channels(scaffolds: int) -> int:
-    """Return the number of input channels D for ``scaffolds`` scaffolds."""
-    return 6 * scaffolds + 18
 
 
 def network_inputs(person: AtlasPerson, maps: TexelMaps, guesses: Tensor) -> Tensor:
@@ -556,9 +541,10 @@ class PersonPredictor(Predictor[AtlasNetwork]):
         rate = ADAPTATION_RATE * len(views)
         optimizer = torch.optim.Adam(self.network.parameters(), lr=rate)
         for step in range(steps):
-            scene = self._scene(maps)
-            time_steps = [scene.time_step(image.time) for image in images]
-            loss = _images_error(scene, time_steps, images, self.background, self.config)[0]
+            person = self._person.person
+            loss, _, _ = _images_error(
+                self._scene(maps), person, images, self.background, self.config
+            )
             if not optimizer_step(optimizer, self.network, loss, rate * (1.0 - step / steps)):
                 break
             on_progress("adapting to the images", step + 1, steps)
@@ -567,11 +553,9 @@ class PersonPredictor(Predictor[AtlasNetwork]):
     def run_config(self, views: Sequence[int]) -> Config:
         """Return the preset for one person, with the template of the network."""
         preset = load_config(packaged_preset("human"), ["data.root=."])
-        shared_keys = ("body", "uv", "resolution", "near", "eps2d", "rasterize_mode", "sh_degree")
-        options = human_options(self.section)
-        human = preset.model.model_copy(
-            update={name: getattr(options, name) for name in shared_keys}
-        )
+        shared_keys = {"body", "uv", "resolution", "near", "eps2d", "rasterize_mode", "sh_degree"}
+        shared = human_options(self.section).model_dump(include=shared_keys)
+        human = preset.model.model_copy(update=shared)
         return preset.model_copy(update={"data": self.data, "model": human})
 
     def begin(self, model: Any, scene: Renderable, config: Config) -> None:
@@ -615,14 +599,9 @@ class AtlasLearner(Learner[AtlasNetwork]):
         targets = self._targets(person_data, self.source_choices[person][choice], generator)
         background = self.sample_background(generator)
         maps = self._maps(person, choice)
-        scene = predict_avatar(self._moved[person], maps, self.mean, self.network)
-        row = person_data.motion.rows[-1 if targets[0].frame is None else targets[0].frame]
-        gaussians, posing = scene.gaussians_in_frame(row, scene.template_weights())
-        frame = RestPose(scene.gaussians.means, posing.rotations[0])
-        time_step = GaussianTimeStep(gaussians, targets[0].time, frame)
-        loss, rendered, truth = _images_error(
-            scene, [time_step] * len(targets), targets, background, self.config
-        )
+        moved = self._moved[person]
+        scene = predict_avatar(moved, maps, self.mean, self.network)
+        loss, rendered, truth = _images_error(scene, moved.person, targets, background, self.config)
         return Example(loss, targets[-1], rendered.detach(), truth, len(scene))
 
     def kept(self) -> dict[str, Tensor]:
@@ -685,7 +664,7 @@ def new_network(model: HumanPredictorModel, generator: torch.Generator) -> Atlas
         raise DyngsError(f"model.resolution={model.resolution} must be a multiple of {factor}")
     scaffolds = len(set(model.scaffold_heights))
     inpaints = model.unseen_colours == "inpainted"
-    return AtlasNetwork(num_input_channels(scaffolds), scaffolds, generator, inpaints)
+    return AtlasNetwork(scaffolds, generator, inpaints)
 
 
 def load_network(network: AtlasNetwork, checkpoint: Checkpoint, resolution: int) -> Tensor:
@@ -698,12 +677,10 @@ def load_network(network: AtlasNetwork, checkpoint: Checkpoint, resolution: int)
 
 def human_options(model: HumanPredictorModel) -> HumanModel:
     """Return the avatar section with the same template and texels, and no learned corrections."""
-    template_keys = ("body", "uv", "resolution")
-    render_keys = ("near", "eps2d", "rasterize_mode", "alpha_min", "transmittance_min")
-    return HumanModel.model_validate(
-        {"sh_degree": 0, "refine": False}
-        | {name: getattr(model, name) for name in template_keys + render_keys}
-    )
+    template_keys = {"body", "uv", "resolution"}
+    render_keys = {"near", "eps2d", "rasterize_mode", "alpha_min", "transmittance_min"}
+    shared = model.model_dump(include=template_keys | render_keys)
+    return HumanModel.model_validate({"sh_degree": 0, "refine": False} | shared)
 
 
 def read_atlas_person(
@@ -720,13 +697,12 @@ def mean_colours(people: list[AtlasPerson], resolution: int) -> Tensor:
 
     Texels that nobody shows get the overall mean.
     """
-    total = torch.zeros(3, resolution, resolution, device="cpu")
-    count = torch.zeros(1, resolution, resolution, device="cpu")
+    sums = torch.zeros(4, resolution, resolution, device="cpu")
     for person in people:
         maps = person.observe(spread_views(person, MEAN_COLOUR_VIEWS))
-        is_seen = (maps.seen[0] > 0).float()[:, None]
-        total += to_atlas(maps.rgb[0] * is_seen, person.texels)
-        count += to_atlas(is_seen, person.texels)
+        is_seen = maps.seen[0, :, None] > 0
+        sums += to_atlas(torch.cat([maps.rgb[0], is_seen], dim=1), person.texels)
+    total, count = sums.split((3, 1))
     overall = total.sum((1, 2)) / count.sum().clamp_min(1)
     return torch.where(count > 0, total / count.clamp_min(1), overall[:, None, None])
 
@@ -738,27 +714,27 @@ def _choices(person: AtlasPerson, source_views: int, generator: torch.Generator)
     """
     firsts = torch.randint(
         len(person.person.views), (VIEW_CHOICES_PER_PERSON,), generator=generator, device="cpu"
-    ).tolist()
-    fewer = list(range(1, source_views)) or [source_views]
-    counts = [
-        fewer[i // 2 % len(fewer)] if i % 2 else source_views
-        for i in range(VIEW_CHOICES_PER_PERSON)
-    ]
-    return [spread_views(person, count, first) for count, first in zip(counts, firsts, strict=True)]
+    )
+    choices = []
+    for i, first in enumerate(firsts.tolist()):
+        fewer = 1 + i // 2 % max(source_views - 1, 1)
+        choices.append(spread_views(person, fewer if i % 2 else source_views, first))
+    return choices
 
 
 def _images_error(
     scene: HumanScene,
-    time_steps: Sequence[GaussianTimeStep],
+    person: Person,
     images: Sequence[Image],
     background: Tensor,
     config: Config,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the mean loss of renders of ``time_steps`` against images, and the last render and
-    image."""
+    """Return the mean loss of renders in the poses of ``person`` against images, and the last
+    render and image."""
     options = replace(render_options(config.model), nonfinite="trust")
     total = torch.zeros((), device=background.device)
-    for image, time_step in zip(images, time_steps, strict=True):
+    for image in images:
+        time_step = scene.time_step_in_pose(person.pose_in(image), image.time or 0.0)
         render = scene.render(image.cameras, time_step, options=options, background=background)
         rendered = render.rgb[0]
         truth = image.composite(background)
