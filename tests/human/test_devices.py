@@ -24,6 +24,7 @@ from dyngs.human.avatar.posing import (
 )
 from dyngs.human.body.atlas import atlas_texels
 from dyngs.human.body.body_reader import read_body
+from dyngs.human.keys import HumanPredictorModel
 from dyngs.human.motion.motion import motion_clip
 from dyngs.human.motion.placement import place_like, place_on_floor, rest_clip
 from dyngs.human.predict.ghg.network import AtlasNetwork
@@ -47,7 +48,7 @@ def test_no_tensor_is_made_on_the_default_device(tmp_path: Path) -> None:
             gaussians, weights, Skeleton(body.joints, body.parents), pose, offsets
         )
         near = nearest_neighbours(found.means)
-        network = AtlasNetwork(2, 1, generator)
+        network = AtlasNetwork(HumanPredictorModel(), generator)
     for tensor in (
         *found.tensors().values(),
         *anchors.tensors().values(),

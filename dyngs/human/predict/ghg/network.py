@@ -8,7 +8,7 @@ Symbols: D input channels, K scaffolds, P texels, S texels per side, M vertices.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
@@ -70,7 +70,7 @@ from dyngs.models.prediction import (
     upsample,
 )
 from dyngs.models.renderable import Renderable
-from dyngs.ops.device import CPU, select_device
+from dyngs.ops.device import select_device
 from dyngs.ops.quaternions import quat_product, unit_quats
 
 
@@ -87,8 +87,7 @@ class AtlasPerson:
 
     def observe(self, views: Sequence[int]) -> TexelMaps:
         """Return the texel maps of some views."""
-        own = self.person
-        return observe_texels(self, ((own.images[i], own.pose_in(own.views[i])) for i in views))
+        return observe_texels(self, [self.person.images[i] for i in views])
 
 
 def atlas_person(person: Person, model: HumanPredictorModel) -> AtlasPerson:
@@ -199,12 +198,13 @@ class TexelMaps:
 
 
 @torch.no_grad()
-def observe_texels(person: AtlasPerson, images: Iterable[tuple[Image, BodyPose]]) -> TexelMaps:
-    """Collect the texel maps of one or more images, each with its body pose."""
+def observe_texels(person: AtlasPerson, images: Sequence[Image]) -> TexelMaps:
+    """Collect the texel maps of one or more images."""
     faces = person.person.body.faces
     offsets: list[Tensor] = []
     observed = []
-    for image, pose in images:
+    for image in images:
+        pose = person.person.pose_in(image)
         camera = image.cameras
         focal = camera.intrinsics[0, 0, 0]
         rgba = image_planes(image)
@@ -235,7 +235,7 @@ def observe_texels(person: AtlasPerson, images: Iterable[tuple[Image, BodyPose]]
             one = [cosine, weight * covered, covered > 0.5, in_frame, to_edge]
             colours = weight[:, None] * sampled[:, :3]
             observed.append(torch.cat([colours, torch.stack(one, dim=1)], dim=1))
-    maps = torch.stack(observed).unflatten(0, (len(offsets), -1))  # (V, K, P, 8)
+    maps = torch.stack(observed).unflatten(0, (len(images), -1))  # (V, K, P, 8)
     seen = maps[..., 3].amax(0)
     to_edge = maps[..., 7].amin(0)
     colour, _, weight, inside, in_frames, _ = maps.sum(0).split((3, 1, 1, 1, 1, 1), dim=-1)
@@ -248,7 +248,7 @@ def observe_texels(person: AtlasPerson, images: Iterable[tuple[Image, BodyPose]]
         to_edge.clamp(-MAX_SILHOUETTE_DISTANCE, MAX_SILHOUETTE_DISTANCE),
         offsets[0],
         fill_unseen_colours(person.texels, rgb[0], seen[0]),
-        len(offsets),
+        len(images),
     )
 
 
@@ -368,9 +368,12 @@ class AtlasNetwork(Encoder):
     the input.
     """
 
-    def __init__(self, scaffolds: int, generator: torch.Generator, inpaints: bool = False) -> None:
-        """Create the network on the CPU for K ``scaffolds``, with weights from ``generator``; with
-        one that ``inpaints``."""
+    def __init__(self, model: HumanPredictorModel, generator: torch.Generator) -> None:
+        """Create the network of ``model`` on the CPU with weights from ``generator``."""
+        factor = 2 ** len(WIDTHS)
+        if model.resolution % factor:
+            raise DyngsError(f"model.resolution={model.resolution} must be a multiple of {factor}")
+        scaffolds = len(set(model.scaffold_heights))
         channels = 6 * scaffolds + 18  # of ``network_inputs``
         with torch.device("cpu"):
             super().__init__(channels, WIDTHS)
@@ -383,7 +386,7 @@ class AtlasNetwork(Encoder):
                 nn.Conv2d(WIDTHS[0] + channels, WIDTHS[0], 3, padding=1), nn.SiLU()
             )
             self.heads = nn.Conv2d(WIDTHS[0], scaffolds * sum(HEADS.values()), 1)
-            self.inpainting = Inpainting() if inpaints else None
+            self.inpainting = Inpainting() if model.unseen_colours == "inpainted" else None
         initialize_weights(self, generator)
         nn.init.zeros_(self.heads.weight)
 
@@ -481,7 +484,7 @@ def predict_avatar(
         painted, is_seen[0] = inpaint_colours(person, maps, network.inpainting)
         guess = painted[texel]
     weight = weight * is_seen.flatten()[rows, None]
-    rgb = weight * maps.rgb.flatten(0, 1)[rows] + (1 - weight) * (guess + part["colour"])
+    rgb = torch.lerp(guess + part["colour"], maps.rgb.flatten(0, 1)[rows], weight)
     one = rgb.new_tensor([1.0, 0.0, 0.0, 0.0])
     limit = min((0.5 * (b - a) for a, b in pairwise(person.heights)), default=_MAX_HEIGHT)
     gaussians = Gaussians(
@@ -572,21 +575,17 @@ class PersonPredictor(Predictor[AtlasNetwork]):
 class AtlasLearner(Learner[AtlasNetwork]):
     """Trains on predictions from one set of views, compared with other views of one time step."""
 
-    def __init__(
-        self,
-        config: Config,
-        network: AtlasNetwork,
-        people: list[AtlasPerson],
-        source_choices: list[list[list[int]]],
-        mean: Tensor,
-        device: torch.device = CPU,
-    ) -> None:
-        """``source_choices`` are the source view sets of each person; their maps are cached."""
-        super().__init__(config, network, [x.person.name for x in people], device)
-        self.people = people
-        self.source_choices = source_choices
-        self.mean = mean
-        self._moved = [move_fields_to(x, device) for x in people]
+    def __init__(self, config: Config, generator: torch.Generator) -> None:
+        """Read the captures; choose source views of each person, whose maps are cached."""
+        device = select_device(config.run.device)
+        model: Any = config.model
+        body = load_template(human_options(model))
+        network = AtlasNetwork(model, generator).to(device)
+        self.people = [read_atlas_person(data, model, body) for data in list_captures(config.data)]
+        super().__init__(config, network, [x.person.name for x in self.people], device)
+        self.source_choices = [_choices(x, model.source_views, generator) for x in self.people]
+        self.mean = mean_colours(self.people, model.resolution).to(device)
+        self._moved = [move_fields_to(x, device) for x in self.people]
         self._maps = cache(self._observed)
 
     def _observed(self, person: int, choice: int) -> TexelMaps:
@@ -623,16 +622,7 @@ class AtlasLearner(Learner[AtlasNetwork]):
         return [person.images[same_frame[i]].to(self.device) for i in order[:TARGET_VIEWS]]
 
 
-def learner(config: Config, generator: torch.Generator) -> AtlasLearner:
-    """Read the captures and return the network in training, before the first step."""
-    device = select_device(config.run.device)
-    model: Any = config.model
-    body = load_template(human_options(model))
-    network = new_network(model, generator).to(device)
-    people = [read_atlas_person(data, model, body) for data in list_captures(config.data)]
-    source_choices = [_choices(person, model.source_views, generator) for person in people]
-    mean = mean_colours(people, model.resolution).to(device)
-    return AtlasLearner(config, network, people, source_choices, mean, device)
+learner = AtlasLearner
 
 
 def predictor(
@@ -648,23 +638,13 @@ def predictor(
     ``log`` and ``on_progress`` receive messages and progress of that fit.
     """
     model: Any = config.model
-    network = new_network(model, torch.Generator())
+    network = AtlasNetwork(model, torch.Generator())
     mean = load_network(network, checkpoint, model.resolution)
     data = ensure_fitted_body(
         data, human_options(model), only_if_needed=True, log=log, on_progress=on_progress
     )
     person = read_atlas_person(data, model, load_template(human_options(model)))
     return PersonPredictor(config, network, mean, person, data)
-
-
-def new_network(model: HumanPredictorModel, generator: torch.Generator) -> AtlasNetwork:
-    """Return the untrained network of ``model``."""
-    factor = 2 ** len(WIDTHS)
-    if model.resolution % factor:
-        raise DyngsError(f"model.resolution={model.resolution} must be a multiple of {factor}")
-    scaffolds = len(set(model.scaffold_heights))
-    inpaints = model.unseen_colours == "inpainted"
-    return AtlasNetwork(scaffolds, generator, inpaints)
 
 
 def load_network(network: AtlasNetwork, checkpoint: Checkpoint, resolution: int) -> Tensor:

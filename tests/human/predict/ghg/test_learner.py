@@ -13,11 +13,11 @@ from dyngs.config import Config
 from dyngs.core.errors import DyngsError
 from dyngs.human.predict.ghg.network import (
     AtlasLearner,
+    AtlasNetwork,
     AtlasPerson,
     PersonPredictor,
     learner,
     mean_colours,
-    new_network,
 )
 from dyngs.training.prediction import network_trainer
 
@@ -87,7 +87,7 @@ def error_after(shown: AtlasPerson, steps: int) -> float:
     """Sum over three views of the mean absolute error on white, of a network trained on these for
     ``steps``."""
     values = {"data": {"root": "."}, "model": NET, "train": {"alpha_weight": 0.1}}
-    network = new_network(NET, torch.Generator().manual_seed(0))
+    network = AtlasNetwork(NET, torch.Generator().manual_seed(0))
     mean = torch.full((3, 32, 32), 0.5)
     views = [0, 3, 6]
     before = {name: x.clone() for name, x in network.state_dict().items()}

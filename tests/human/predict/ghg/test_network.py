@@ -27,12 +27,13 @@ from dyngs.human.predict.ghg.network import (
 
 
 def test_predictions_are_zero_before_training() -> None:
-    found = AtlasNetwork(3, torch.Generator().manual_seed(0))(torch.rand(36, 32, 32))
-    assert found.shape == (3, sum(HEADS.values()), 32, 32)
+    found = AtlasNetwork(NET, torch.Generator().manual_seed(0))(torch.rand(30, 32, 32))
+    assert found.shape == (2, sum(HEADS.values()), 32, 32)
     assert (found == 0).all()
 
 
 Shown = tuple[AtlasPerson, TexelMaps]
+INPAINTED = NET.model_copy(update={"unseen_colours": "inpainted"})
 MEAN = torch.full((3, NET.resolution, NET.resolution), 0.25)
 
 
@@ -44,7 +45,7 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> Shown:
 
 def constant_network(bias: dict[str, float] | None = None) -> AtlasNetwork:
     """Return a network with constant output: 0, or ``bias`` in every channel of some heads."""
-    made = AtlasNetwork(2, torch.Generator().manual_seed(0))
+    made = AtlasNetwork(NET, torch.Generator().manual_seed(0))
     names = [name for _ in range(2) for name, count in HEADS.items() for _ in range(count)]
     with torch.no_grad():
         made.heads.bias.copy_(torch.tensor([(bias or {}).get(name, 0.0) for name in names]))  # type: ignore[union-attr]
@@ -121,7 +122,7 @@ def test_unseen_texels_are_painted_and_mistrusted_ones_too(shown: Shown) -> None
 def test_inpainting_fills_the_dilated_hole_alone(shown: Shown) -> None:
     """Against a dilation in SciPy; texels beside the hole keep the colours of the images."""
     sitter, maps = shown
-    made = AtlasNetwork(2, torch.Generator().manual_seed(0), inpaints=True)
+    made = AtlasNetwork(INPAINTED, torch.Generator().manual_seed(0))
     plain = constant_network().state_dict()
     own = made.state_dict()
     assert all(torch.equal(own[name], x) for name, x in plain.items() if name[0] != "h")
@@ -158,7 +159,7 @@ def test_a_gated_convolution_is_elu_times_twice_the_sigmoid() -> None:
 
 
 def test_inpainting_learns(shown: Shown) -> None:
-    made = AtlasNetwork(2, torch.Generator().manual_seed(0), inpaints=True)
+    made = AtlasNetwork(INPAINTED, torch.Generator().manual_seed(0))
     assert made.inpainting is not None
     predict_avatar(*shown, MEAN, made).gaussians.base_rgb.square().sum().backward()
     for name, parameter in made.inpainting.named_parameters():

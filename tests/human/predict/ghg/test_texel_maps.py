@@ -17,7 +17,6 @@ from dyngs.data.capture import BodyFrames, Capture, View
 from dyngs.data.geometry import from_opengl_pose
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.synthetic.captures import CAMERA_ANGLE_X
-from dyngs.human.avatar.posing import BodyPose
 from dyngs.human.body.atlas import Texels, atlas_texels
 from dyngs.human.body.body import BodyTemplate, posed_vertices
 from dyngs.human.body.body_reader import default_template
@@ -133,16 +132,12 @@ def is_arm(joints: np.ndarray | Tensor) -> np.ndarray:
     return np.array([any(part in name for part in arm) for name in names])
 
 
-def posing(of: AtlasPerson) -> BodyPose:
-    return of.person.pose_in(of.person.views[0])
-
-
 def test_distances_from_the_edge_are_those_of_the_outline() -> None:
     """From the front, texels on the outer side of the legs lie on it, and those 4 cm above them 4
     cm outside."""
     shown = sitter(torch.zeros(55, 3))
     seen = image(torch.zeros(55, 3), np.full((4, 4, 3), 0.5), FRONT)
-    maps = observe_texels(shown, [(seen, posing(shown))])
+    maps = observe_texels(shown, [seen])
     points = shown.texels.points
     normals = shown.texels.normals
     outer = (
@@ -168,16 +163,14 @@ def test_texels_behind_an_arm_do_not_get_its_colour() -> None:
         lambda _, joints: np.where(is_arm(joints)[:, None], [0.9, 0.0, 0.0], [0.0, 0.0, 0.9])
     )
     crossed = sitter(arms_before_the_chest())
-    maps = observe_texels(
-        crossed, [(image(arms_before_the_chest(), texture, FRONT), posing(crossed))]
-    )
+    maps = observe_texels(crossed, [image(arms_before_the_chest(), texture, FRONT)])
     arms = torch.from_numpy(is_arm(crossed.texels.weights.argmax(1)))
     redness = maps.rgb[0, :, 0] / maps.rgb[0].sum(1).clamp_min(1e-6)
     seen = maps.seen[0] > 0.3
     assert (redness[seen & arms] > 0.5).float().mean() > 0.9, "fingers are thinner than a pixel"
     assert (redness[seen & ~arms] < 0.5).float().mean() > 0.98
     aside = sitter(torch.zeros(55, 3))
-    free = observe_texels(aside, [(image(torch.zeros(55, 3), texture, FRONT), posing(aside))])
+    free = observe_texels(aside, [image(torch.zeros(55, 3), texture, FRONT)])
     x, y, _ = aside.texels.points.T
     chest = (free.seen[0] > 0.8) & ~arms & (x.abs() < 0.2) & ((y - 0.55).abs() < 0.08)
     assert (maps.seen[0][chest] == 0).float().mean() > 0.1, "forearms cover a part of it"
@@ -188,7 +181,7 @@ def test_a_texel_has_the_colour_of_its_place() -> None:
     change."""
     texture = painted(lambda positions, _: 0.5 + 0.4 * np.sin(3 * positions))
     aside = sitter(torch.zeros(55, 3))
-    shown = [(image(torch.zeros(55, 3), texture, pose), posing(aside)) for pose in (FRONT, RIGHT)]
+    shown = [image(torch.zeros(55, 3), texture, pose) for pose in (FRONT, RIGHT)]
     maps = observe_texels(aside, shown)
     seen = maps.seen[0] > 0.5
     truth = 0.5 + 0.4 * torch.sin(3 * aside.texels.points)
