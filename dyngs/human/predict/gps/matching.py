@@ -39,12 +39,14 @@ class CostVolumeNetwork(nn.Module):
     def __init__(self, widths: Sequence[int]) -> None:
         super().__init__()
         fine, middle, coarse = widths
-        self.enter = _block(2 * NUM_OFFSETS + fine, fine)
+        self.enter = residual_layer(2 * NUM_OFFSETS + fine, fine)
         self.down = nn.ModuleList(
-            [_block(fine + middle, middle, 2), _block(middle + coarse, coarse, 2)]
+            [residual_layer(fine + middle, middle, 2), residual_layer(middle + coarse, coarse, 2)]
         )
         self.deep = ResidualBlock(coarse)
-        self.up = nn.ModuleList([_block(coarse + middle, middle), _block(middle + fine, fine)])
+        self.up = nn.ModuleList(
+            [residual_layer(coarse + middle, middle), residual_layer(middle + fine, fine)]
+        )
         self.change = _convolution(fine, NUM_OFFSETS + 1)
         self.weights = _convolution(fine, 9 * QUARTER**2)
 
@@ -74,7 +76,8 @@ class CostVolumeNetwork(nn.Module):
         ], middle
 
 
-def _block(before: int, width: int, stride: int = 1) -> nn.Module:
+def residual_layer(before: int, width: int, stride: int = 1) -> nn.Module:
+    """Return a convolution from ``before`` to ``width`` channels and a residual block."""
     return nn.Sequential(nn.Conv2d(before, width, 3, stride, padding=1), ResidualBlock(width))
 
 
@@ -84,10 +87,8 @@ def _convolution(before: int, width: int, size: int = 3) -> nn.Conv2d:
 
 def candidate_offsets(shift: Tensor) -> list[int]:
     """Return D candidate offsets, even px, for the disparity ``shift`` of the person's middle."""
-    return [
-        2 * round(float(x))
-        for x in (shift / 2) * torch.linspace(*RANGE, NUM_OFFSETS, device=shift.device)
-    ]
+    halves = shift / 2 * torch.linspace(*RANGE, NUM_OFFSETS, device=shift.device)
+    return (2 * halves.round()).int().tolist()
 
 
 def plane_sweep_costs(rgb: Tensor, alpha: Tensor, offsets: Sequence[int]) -> Tensor:
@@ -104,10 +105,10 @@ def plane_sweep_costs(rgb: Tensor, alpha: Tensor, offsets: Sequence[int]) -> Ten
     colours = []
     beside = []
     for offset in offsets:
-        starts = (padding - int(side) * max(-padding, min(padding, offset // 2)) for side in SIDES)
-        other = torch.stack(
-            [view[..., at : at + width] for view, at in zip(padded, starts, strict=True)]
-        )
+        step = max(-padding, min(padding, offset // 2))
+        right = padded[0].narrow(2, padding - step, width)
+        left = padded[1].narrow(2, padding + step, width)
+        other = torch.stack([right, left])
         colours.append((other[:, :3] - layers[:, :3]).abs().mean(1))
         beside.append(1 - other[:, 3])
     volume = torch.stack([*colours, *beside], dim=1)
@@ -134,13 +135,10 @@ def convex_upsample(coarse: Tensor, weights: Tensor, inside: Tensor) -> Tensor:
 
 def _gaussian_logits(like: Tensor) -> Tensor:
     """Return Gaussian logits (9, 4, 4, 1, 1) of 3 x 3 neighbours for each of 4 x 4 pixels."""
-    pixel = (torch.arange(QUARTER, dtype=like.dtype, device=like.device) + 0.5) / QUARTER - 0.5
-    square = (
-        torch.arange(-1.0, 2.0, dtype=like.dtype, device=like.device)[:, None] - pixel
-    ).square()
-    return -_SHARPNESS * (square[:, None, :, None] + square[None, :, None, :]).reshape(
-        9, QUARTER, QUARTER, 1, 1
-    )
+    pixels = (torch.arange(QUARTER, device=like.device) + 0.5) / QUARTER - 0.5
+    square = (torch.arange(-1, 2, device=like.device)[:, None] - pixels).square()
+    distances = square[:, None, :, None] + square[:, None]
+    return -_SHARPNESS * distances.view(9, QUARTER, QUARTER, 1, 1)
 
 
 LEVELS = 4
@@ -168,7 +166,7 @@ class RecurrentNetwork(nn.Module):
         wide = 8 * width // 3
         joined = width + 2 * part
         self.updates = updates
-        self.enter = _block(sum(widths), width)
+        self.enter = residual_layer(sum(widths), width)
         self.split = nn.Sequential(
             nn.GroupNorm(GROUPS, width), nn.SiLU(), _convolution(width, 3 * width)
         )

@@ -314,7 +314,7 @@ def _rays(principal: Tensor, focal: float, size: Sequence[int]) -> Tensor:
 
 def _pixel_centres(size: Sequence[int], like: Tensor) -> Tensor:
     """Return columns and rows (H, W, 2) of the centres of H x W pixels."""
-    rows, columns = (torch.arange(side).to(like) + 0.5 for side in size)
+    rows, columns = (torch.arange(side, device=like.device) + 0.5 for side in size)
     return torch.stack(torch.meshgrid(columns, rows, indexing="xy"), dim=-1)
 
 

@@ -13,10 +13,7 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import (
-    pixel_shuffle,
-    pixel_unshuffle,
-)
+from torch.nn.functional import pixel_shuffle, pixel_unshuffle
 
 from dyngs.config import Config, DataConfig
 from dyngs.config.io import load_config, packaged_preset
@@ -31,7 +28,7 @@ from dyngs.gaussians.filters import FilterUpdate
 from dyngs.gaussians.scene import render_options
 from dyngs.gaussians.static_scene import StaticScene, ViewSides
 from dyngs.gaussians.static_training import StaticTraining
-from dyngs.human.predict.gps.matching import CostVolumeNetwork, RecurrentNetwork
+from dyngs.human.predict.gps.matching import CostVolumeNetwork, RecurrentNetwork, residual_layer
 from dyngs.human.predict.gps.rectification import (
     MAX_ANGLE,
     RectifiedPair,
@@ -49,7 +46,6 @@ from dyngs.models.prediction import (
     Encoder,
     Example,
     Predictor,
-    ResidualBlock,
     image_loss,
     initialize_weights,
     load_weights,
@@ -94,8 +90,7 @@ class GpsNetwork(nn.Module):
             self.depth_encoder = Encoder(8, _DEPTH_WIDTHS)
             below = quarter + _DEPTH_WIDTHS[1] + _DEPTH_WIDTHS[2]
             self.up = nn.ModuleList(
-                nn.Sequential(nn.Conv2d(before, half, 3, padding=1), ResidualBlock(half))
-                for before in (below, 2 * half + _DEPTH_WIDTHS[0])
+                [residual_layer(below, half), residual_layer(2 * half + _DEPTH_WIDTHS[0], half)]
             )
             self.last = nn.Sequential(nn.Conv2d(half + 20, _LAST, 3, padding=1), nn.SiLU())
             self.heads = nn.Conv2d(_LAST, 4 * sum(HEADS.values()), 1)
@@ -147,7 +142,6 @@ def surface_gaussians_of_pair(pair: RectifiedPair, offsets: Tensor, raw: Tensor)
     scales = LARGEST * pixel * (part["scale"] + _SCALE_LOGIT).sigmoid()
     within = (pair.alpha * pair.in_other_view(pair.alpha, offsets))[solid[:, None]]
     opacities = (part["opacity"][:, 0] + _OPACITY_LOGIT).sigmoid() * within
-    opacities = opacities.clamp(1e-4, 1 - 1e-4)
     one = part["rotation"].new_tensor([1.0, 0.0, 0.0, 0.0])
     world_from_rect = quats_from_matrices(pair.rect_from_world.T[None])
     rgb = pair.rgb.permute(0, 2, 3, 1)[solid]
@@ -155,7 +149,7 @@ def surface_gaussians_of_pair(pair: RectifiedPair, offsets: Tensor, raw: Tensor)
         means=pair.points(depth)[solid],
         quats=quat_product(world_from_rect.expand(len(rgb), 4), unit_quats(one + part["rotation"])),
         log_scales=scales.clamp_min(1e-12).log(),
-        logit_opacities=(opacities / (1 - opacities)).log(),
+        logit_opacities=opacities.logit(eps=1e-4),
         sh=((rgb - 0.5) / SH_C0)[:, None],
     )
 
@@ -215,8 +209,7 @@ class GpsPredictor(Predictor[GpsNetwork]):
     @torch.no_grad()
     def predict(self, views: Sequence[int]) -> StaticScene:
         pairs = neighbour_pairs(self.name, self.views, views)
-        loader = ImageLoader(self.views, self.data)
-        images = {i: loader[i] for i in views}
+        images = ImageLoader(self.views, self.data)
         surfaces = []
         centers = []
         for pair in pairs:
@@ -246,10 +239,8 @@ class GpsPredictor(Predictor[GpsNetwork]):
 
     def run_config(self, views: Sequence[int]) -> Config:
         preset = load_config(packaged_preset("static"), ["data.root=."])
-        shared_keys = ("near", "eps2d", "rasterize_mode", "sh_degree")
-        model = preset.model.model_copy(
-            update={name: getattr(self.config.model, name) for name in shared_keys}
-        )
+        shared_keys = {"near", "eps2d", "rasterize_mode", "sh_degree"}
+        model = preset.model.model_copy(update=self.section.model_dump(include=shared_keys))
         filmed = all_views({k: x for k, x in self._capture.splits.items() if k != "pose"})
         data = self.data_at_time(self.views[views[0]].time, filmed)
         return preset.model_copy(update={"data": data, "model": model})
@@ -287,9 +278,10 @@ class GpsLearner(CaptureLearner[GpsNetwork, _Opened]):
         only_depth = step <= round(self.section.depth_fraction * self.config.train.steps)
         offsets, raw = self.network(rectified, with_gaussians=not only_depth)
         depth_loss = self._depth_loss(rectified, offsets)
-        scores = {"end_point_error_px": float(end_point_error(rectified, offsets[-1].detach()))}
+        last = offsets[-1].detach()
+        scores = {"end_point_error_px": float(end_point_error(rectified, last))}
         if only_depth:
-            predicted = _offset_image(rectified, offsets[-1].detach())
+            predicted = _offset_image(rectified, last)
             truth = _offset_image(rectified, rectified.offsets)
             return Example(depth_loss, left, predicted, truth, scores=scores)
         gaussians = surface_gaussians_of_pair(rectified, offsets[-1], raw)
