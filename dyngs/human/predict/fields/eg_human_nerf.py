@@ -92,8 +92,8 @@ class EgHumanNerf(FieldNetwork):
 
     def prepare(self, person: EncodedPerson) -> Tensor:
         """Return the depth maps (V, 1, H, W) of the body in the images, m."""
-        depths = [person.body.depth(camera) for camera in person.sources.cameras]
-        return torch.stack(depths)[:, None].clamp(max=_FAR)
+        depths = [person.body.depth(camera)[None] for camera in person.sources.cameras]
+        return torch.stack(depths).clamp(max=_FAR)
 
     def limits(self, person: EncodedPerson, camera: Cameras, z: Tensor) -> tuple[Tensor, Tensor]:
         """Values are start and end of the sampled interval, and the distance of the body, m."""
@@ -140,7 +140,8 @@ class EgHumanNerf(FieldNetwork):
 
         count = PARAMS.samples
         shifts = sample_offsets(len(rays), count, generator=generator)
-        at = first + (last - first) * (torch.arange(count, device="cpu") + shifts).to(first) / count
+        places = (torch.arange(count, device="cpu") + shifts).to(first) / count
+        at = torch.lerp(first, last, places)
         _, seen, height = look_up(at)
         closest = height.amin(1, keepdim=True)
         max_alpha = seen.alpha.amin(0).view(at.shape).amax(1, keepdim=True)
@@ -182,10 +183,11 @@ class EgHumanNerf(FieldNetwork):
         assert image.alpha is not None
         _, z = camera_rays(image.cameras.scaled(self.keys.supersampling))
         maps = torch.stack([image.depth, image.alpha])[None]
-        depth, alpha = interpolate(maps, scale_factor=self.keys.supersampling)[0].flatten(1)
-        surface = (depth / (scale * z))[:, None]
-        misses = alpha[:, None] < _EDGE
-        is_known = misses | ((alpha[:, None] > 1 - _EDGE) & (surface > 0))
+        finer = interpolate(maps, scale_factor=self.keys.supersampling)
+        depth, alpha = finer.flatten()[:, None].chunk(2)
+        surface = depth / (scale * z[:, None])
+        misses = alpha < _EDGE
+        is_known = misses | ((alpha > 1 - _EDGE) & (surface > 0))
         limit = PARAMS.limit
         for rays, at, signed in picture.samples:
             deviation = (signed - (surface[rays] - at).clamp(-limit, limit)).abs()
@@ -259,9 +261,7 @@ class Refinement(nn.Module):
         """
         height, width = through.shape
         alpha = 1 - through
-        planes = torch.cat(
-            [colour, alpha[..., None], (depth - alpha * middle)[..., None]], -1
-        ).permute(2, 0, 1)[None]
+        planes = torch.stack([*colour.unbind(2), alpha, depth - alpha * middle])[None]
         levels = [self.first(pad(planes, (0, -width % 4, 0, -height % 4))).relu()]
         for layer in self.down:
             levels.append(layer(levels[-1]).relu())

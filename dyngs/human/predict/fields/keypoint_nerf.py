@@ -134,16 +134,12 @@ def spatial_code(points: Tensor, key_points: Tensor, sources: Sources) -> Tensor
     PARAMS.reach^2)); dz is the depth difference and d the distance, m.
     """
     apart = points[:, None] - key_points
-    weight = (-apart.square().sum(-1) / (2 * PARAMS.reach**2)).exp()[None]
-    axes = sources.cam_from_world[:, 2, :3]
-    dz = (axes @ apart.view(-1, 3).T).view(len(axes), *apart.shape[:2])
-    sine = (math.pi * dz).sin()
-    cosine = (math.pi * dz).cos()
+    weight = (-apart.square().sum(-1) / (2 * PARAMS.reach**2)).exp()
+    dz = torch.einsum("vc,mjc->vmj", sources.cam_from_world[:, 2, :3], apart)
     parts = [dz]
     for octave in range(PARAMS.octaves):
-        if octave:
-            sine, cosine = 2 * sine * cosine, 1 - 2 * sine.square()
-        parts += [sine, cosine]
+        angle = math.pi * 2**octave * dz
+        parts += [angle.sin(), angle.cos()]
     return torch.cat([part * weight for part in parts], -1)
 
 

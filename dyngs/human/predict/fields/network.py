@@ -143,15 +143,19 @@ def initialize_network(network: nn.Module, generator: torch.Generator) -> None:
             nn.init.zeros_(layer.bias)
 
 
-def mean_over_views(values: Tensor, weights: Tensor | None = None) -> Tensor:
+def mean_over_views(values: Tensor, weights: Tensor) -> Tensor:
     """Return the mean (M, D) over views of values (V, M, D), with weights (V, M) that sum to 1."""
-    return values.mean(0) if weights is None else (weights[..., None] * values).sum(0)
+    return (weights[..., None] * values).sum(0)
 
 
 def mean_and_variance(values: Tensor, weights: Tensor | None = None) -> Tensor:
-    """Return mean and variance (M, 2 D) over views, see ``mean_over_views``."""
-    mean = mean_over_views(values, weights)
-    return torch.cat([mean, mean_over_views((values - mean).square(), weights)], -1)
+    """Return mean and variance (M, 2 D) over views; None: all weights are equal."""
+    if weights is None:
+        variance, mean = torch.var_mean(values, 0, correction=0)
+    else:
+        mean = mean_over_views(values, weights)
+        variance = mean_over_views((values - mean).square(), weights)
+    return torch.cat([mean, variance], -1)
 
 
 def view_weights(

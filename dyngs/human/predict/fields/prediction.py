@@ -208,8 +208,8 @@ class FieldPredictor(Predictor[FieldNetwork]):
 
     def run_config(self, views: Sequence[int]) -> Config:
         data = self.data_at_time(self.views[views[0]].time, self.views)
-        keys = self.section.model_dump(include=set(PredictedFieldModel.model_fields) - {"kind"})
-        model = PredictedFieldModel.model_validate({"network": self.section.kind} | keys)
+        section = self.section
+        model = PredictedFieldModel(network=section.kind, supersampling=section.supersampling)
         return self.config.model_copy(update={"data": data, "model": model})
 
     def begin(self, model: Any, scene: Renderable, config: Config) -> None:
@@ -223,22 +223,17 @@ class FieldLearner(CaptureLearner[FieldNetwork, Person]):
         captured = self.opened(person)
         sources, target = self._views(captured, generator)
         body, scale = captured.body_in(captured.views[target], self.device)
-        sources_in = move_fields_to(
-            crop_source_images([captured.images[i] for i in sources], scale), self.device
-        )
-        image = captured.images[target]
-        image = _random_patch(image, self.section.patch, generator).to(self.device)
+        crops = crop_source_images([captured.images[i] for i in sources], scale)
+        encoded = self.network.encode(move_fields_to(crops, self.device), body)
+        patch = _random_patch(captured.images[target], self.section.patch, generator)
+        image = patch.to(self.device)
         background = self.sample_background(generator)
-        encoded = self.network.encode(sources_in, body)
-        field_picture = self.network.render(
-            encoded, cameras_in_metres(image.cameras, scale), generator
-        )
-        rendered = field_picture.colour + field_picture.transmittance[..., None] * background
+        camera = cameras_in_metres(image.cameras, scale)
+        picture = self.network.render(encoded, camera, generator)
+        rendered = picture.colour + picture.transmittance[..., None] * background
         truth = image.composite(background)
-        loss = image_loss(
-            rendered, 1 - field_picture.transmittance, image, truth, self.config.train
-        )
-        loss = loss + self.network.penalty(field_picture, image, scale)
+        loss = image_loss(rendered, 1 - picture.transmittance, image, truth, self.config.train)
+        loss = loss + self.network.penalty(picture, image, scale)
         return Example(loss, image, rendered.detach(), truth)
 
     def _views(self, person: Person, generator: torch.Generator) -> tuple[list[int], int]:
