@@ -6,7 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from dyngs.config import Config
-from dyngs.human.predict.keys import GpsModel
+from dyngs.human.predict.kind import GpsModel
 from dyngs.human.synthetic.capture import PeopleOptions, write_people
 
 STEREO = GpsModel(person_px=32)

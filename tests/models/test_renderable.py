@@ -26,7 +26,7 @@ from dyngs.gaussians import Gaussians
 from dyngs.gaussians.levels import LevelScene
 from dyngs.gaussians.static_scene import StaticScene, ViewSides
 from dyngs.human.predict.fields.prediction import NETWORKS, PredictedField
-from dyngs.human.predict.keys import PredictedFieldModel
+from dyngs.human.predict.kind import PredictedFieldModel
 from dyngs.human.predict.people import PosedBody, Sources
 from dyngs.models.renderable import Renderable
 from dyngs.ops.rays import Space

@@ -38,7 +38,7 @@ from dyngs.human.predict.fields.network import (
     sample_offsets,
     view_weights,
 )
-from dyngs.human.predict.keys import FieldKeys
+from dyngs.human.predict.kind import FieldKeys
 from dyngs.human.predict.people import DILATION, sample_maps
 from dyngs.models.volume import camera_rays
 from dyngs.ops.rays import Rays

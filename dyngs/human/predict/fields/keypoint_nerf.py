@@ -34,7 +34,7 @@ from dyngs.human.predict.fields.network import (
     sample_offsets,
     view_weights,
 )
-from dyngs.human.predict.keys import FieldKeys
+from dyngs.human.predict.kind import FieldKeys
 from dyngs.human.predict.people import NUM_KEY_POINTS, Sources, sample_maps
 from dyngs.models.volume import select_samples, visible_samples
 from dyngs.ops.rays import MarchSteps, Rays, Space, composite, march

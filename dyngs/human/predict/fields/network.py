@@ -17,7 +17,7 @@ from torch.nn.functional import normalize
 
 from dyngs.core.camera import Cameras
 from dyngs.data.loader import Image
-from dyngs.human.predict.keys import FieldKeys
+from dyngs.human.predict.kind import FieldKeys
 from dyngs.human.predict.people import PosedBody, Sources, sample_maps
 from dyngs.models.prediction import Encoder, initialize_weights, upsample
 from dyngs.models.volume import camera_rays

@@ -34,7 +34,7 @@ from dyngs.human.predict.gps.rectification import (
     spread_around_person,
     training_pairs,
 )
-from dyngs.human.predict.keys import PredictedFieldModel
+from dyngs.human.predict.kind import PredictedFieldModel
 from dyngs.human.predict.people import (
     MULTIPLE,
     Person,

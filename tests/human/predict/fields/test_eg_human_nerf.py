@@ -18,7 +18,7 @@ from dyngs.human.predict.fields.eg_human_nerf import (
 )
 from dyngs.human.predict.fields.keypoint_nerf import KeypointNerf
 from dyngs.human.predict.fields.network import EncodedPerson, FieldNetwork
-from dyngs.human.predict.keys import FieldKeys
+from dyngs.human.predict.kind import FieldKeys
 from dyngs.human.predict.people import (
     Person,
     cameras_in_metres,

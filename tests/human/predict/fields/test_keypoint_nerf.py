@@ -14,7 +14,7 @@ from dyngs.human.predict.fields.keypoint_nerf import (
     spatial_code,
 )
 from dyngs.human.predict.fields.network import EncodedPerson
-from dyngs.human.predict.keys import FieldKeys
+from dyngs.human.predict.kind import FieldKeys
 from dyngs.human.predict.people import (
     Person,
     PosedBody,

@@ -17,7 +17,7 @@ from dyngs.human.predict.fields.prediction import (
     PredictedField,
     restore,
 )
-from dyngs.human.predict.keys import PredictedFieldModel
+from dyngs.human.predict.kind import PredictedFieldModel
 from dyngs.human.predict.people import Person, crop_source_images
 from dyngs.models.checkpoint import Checkpoint, CheckpointInfo, restore_model
 from dyngs.models.renderable import DrawOptions

@@ -30,7 +30,7 @@ from dyngs.gaussians.static_scene import StaticScene
 from dyngs.human.predict.gps.matching import RecurrentNetwork
 from dyngs.human.predict.gps.rectification import neighbour_pairs
 from dyngs.human.predict.gps.stereo import GpsNetwork, learner, predictor
-from dyngs.human.predict.keys import GpsModel
+from dyngs.human.predict.kind import GpsModel
 from dyngs.human.synthetic.capture import PeopleOptions, write_people
 from dyngs.models.prediction import Predictor, load_weights
 from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint, load_run

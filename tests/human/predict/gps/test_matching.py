@@ -21,7 +21,7 @@ from dyngs.human.predict.gps.matching import (
 )
 from dyngs.human.predict.gps.rectification import SIDES, RectifiedPair
 from dyngs.human.predict.gps.stereo import GpsNetwork, end_point_error, offset_loss
-from dyngs.human.predict.keys import GpsModel
+from dyngs.human.predict.kind import GpsModel
 from dyngs.models.prediction import Encoder
 
 WIDTHS = (8, 16, 16)

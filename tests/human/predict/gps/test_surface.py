@@ -15,7 +15,7 @@ from dyngs.human.predict.gps.stereo import (
     offset_loss,
     surface_gaussians_of_pair,
 )
-from dyngs.human.predict.keys import GpsModel
+from dyngs.human.predict.kind import GpsModel
 
 
 @pytest.fixture(scope="module")
