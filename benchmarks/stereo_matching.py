@@ -33,9 +33,8 @@ from dyngs.config.io import load_config, load_resolved, packaged_preset
 from dyngs.core.errors import log_info
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import list_captures, read_capture
-from dyngs.human.predict.gps.matching import RecurrentNetwork
 from dyngs.human.predict.gps.rectification import rectify_views, training_pairs
-from dyngs.human.predict.gps.stereo import GpsNetwork, end_point_error
+from dyngs.human.predict.gps.stereo import GpsNetwork, RecurrentNetwork, end_point_error
 from dyngs.io.write import write_text
 from dyngs.models.prediction import load_weights
 from dyngs.ops.device import select_device, synchronize

@@ -27,9 +27,8 @@ from dyngs.data.loader import ImageLoader
 from dyngs.data.read import list_captures, read_capture
 from dyngs.evaluate.report import evaluate_run
 from dyngs.gaussians.static_scene import StaticScene
-from dyngs.human.predict.gps.matching import RecurrentNetwork
 from dyngs.human.predict.gps.rectification import neighbour_pairs
-from dyngs.human.predict.gps.stereo import GpsNetwork, learner, predictor
+from dyngs.human.predict.gps.stereo import GpsNetwork, RecurrentNetwork, learner, predictor
 from dyngs.human.predict.kind import GpsModel
 from dyngs.human.synthetic.capture import PeopleOptions, write_people
 from dyngs.models.prediction import Predictor, load_weights

@@ -6,21 +6,23 @@ import pytest
 import torch
 from torch import Tensor
 
-from dyngs.human.predict.gps.matching import (
+from dyngs.human.predict.gps.rectification import SIDES, RectifiedPair
+from dyngs.human.predict.gps.stereo import (
     LEVELS,
     NUM_OFFSETS,
     QUARTER,
     RADIUS,
     CostVolumeNetwork,
+    GpsNetwork,
     RecurrentNetwork,
     candidate_offsets,
     convex_upsample,
     correlation_pyramid,
+    end_point_error,
     look_up,
+    offset_loss,
     plane_sweep_costs,
 )
-from dyngs.human.predict.gps.rectification import SIDES, RectifiedPair
-from dyngs.human.predict.gps.stereo import GpsNetwork, end_point_error, offset_loss
 from dyngs.human.predict.kind import GpsModel
 from dyngs.models.prediction import Encoder
 
