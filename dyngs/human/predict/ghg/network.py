@@ -37,7 +37,7 @@ from dyngs.gaussians import Gaussians
 from dyngs.gaussians.scene import render_options
 from dyngs.gaussians.schedule import RateSchedule
 from dyngs.human.avatar.observations import FACING_EXPONENT, project_points
-from dyngs.human.avatar.posing import BodyPose, Skeleton, pose_blend_shapes, texel_gaussians
+from dyngs.human.avatar.posing import Skeleton, pose_blend_shapes, texel_gaussians
 from dyngs.human.avatar.scene import HumanScene, initial_human_scene
 from dyngs.human.avatar.training import HumanTraining
 from dyngs.human.body.atlas import Texels, atlas_texels
@@ -79,7 +79,7 @@ class AtlasPerson:
     """Captured person with the texels of the UV map, as input of a prediction."""
 
     person: Person
-    normals: Tensor  # (M, 3) unit vertex normals of the body
+    scaffolds: Tensor  # (K, M, 3) vertices in the rest pose, m
     texels: Texels  # P, in the person's shape
     mirror: Tensor  # (P,) index of the mirrored texel
     heights: tuple[float, ...]  # (K,) of the scaffolds, m, ascending
@@ -97,9 +97,10 @@ def atlas_person(person: Person, model: HumanPredictorModel) -> AtlasPerson:
     heights = tuple(sorted(set(model.scaffold_heights)))
     gaussians, anchors = texel_gaussians(texels, heights, 0)
     skeleton = Skeleton(body.joints, body.parents)
+    normals = mesh_normals(body.vertices, body.faces)
     return AtlasPerson(
         person=person,
-        normals=mesh_normals(body.vertices, body.faces),
+        scaffolds=body.vertices + texels.points.new_tensor(heights)[:, None, None] * normals,
         texels=texels,
         mirror=mirror_texels(texels),
         heights=heights,
@@ -200,7 +201,8 @@ class TexelMaps:
 @torch.no_grad()
 def observe_texels(person: AtlasPerson, images: Sequence[Image]) -> TexelMaps:
     """Collect the texel maps of one or more images."""
-    faces = person.person.body.faces
+    body = person.person.body
+    faces = body.faces
     offsets: list[Tensor] = []
     observed = []
     for image in images:
@@ -209,7 +211,8 @@ def observe_texels(person: AtlasPerson, images: Sequence[Image]) -> TexelMaps:
         focal = camera.intrinsics[0, 0, 0]
         rgba = image_planes(image)
         planes = torch.cat([rgba, _edge_distances(rgba[3])[None]])
-        scaffolds = [_posed_vertices(person, pose, height) for height in person.heights]
+        posed, _ = skin(body, person.scaffolds, body.joints, pose.rotations)
+        scaffolds = pose.scale * posed + pose.trans
         normals = normalize(_at_texels(person, mesh_normals(scaffolds[0], faces)), dim=1)
         offsets.append(normals @ pose.rotations[0])
         for vertices in scaffolds:
@@ -294,14 +297,6 @@ def _at_texels(person: AtlasPerson, values: Tensor) -> Tensor:
     """Interpolate vertex values (M, 3) at the texels; return (P, 3)."""
     corners = person.person.body.faces[person.texels.faces]
     return (person.texels.barycentric[..., None] * values[corners]).sum(1)
-
-
-def _posed_vertices(person: AtlasPerson, pose: BodyPose, height: float) -> Tensor:
-    """Return the vertices (M, 3) of a scaffold in world coordinates."""
-    body = person.person.body
-    vertices = body.vertices + height * person.normals
-    posed, _ = skin(body, vertices, body.joints, pose.rotations)
-    return pose.scale * posed + pose.trans
 
 
 WIDTHS = (24, 32, 48, 64)
