@@ -119,8 +119,8 @@ class EgHumanNerf(FieldNetwork):
             """Return points (R K, 3), their image features, and heights (R, K) above the body."""
             points = rays.origins[:, None] + rays.directions[:, None] * at[..., None]
             points = points.flatten(0, 1)
-            height = person.body.height(points).view(at.shape)
-            return points, person.sample(points), height.clamp(-PARAMS.limit, PARAMS.limit)
+            height = person.body.height(points).clamp(-PARAMS.limit, PARAMS.limit)
+            return points, person.sample(points), height.view(at.shape)
 
         def inputs(
             seen: PointFeatures, height: Tensor, at: Tensor, weights: Tensor | None = None

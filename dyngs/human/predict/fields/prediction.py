@@ -102,12 +102,16 @@ class PredictedField(RayScene):
             return self.network.encode(self.sources, self.body)
 
     def state(self) -> State:
-        tensors = {f"network.{name}": x for name, x in self.network.state_dict().items()}
-        tensors |= {f"sources.{name}": x for name, x in vars(self.sources).items()}
-        body = vars(dataclasses.replace(self.body))  # without what it keeps
-        tensors |= {f"body.{name}": x for name, x in body.items()}
-        tensors["numbers"] = torch.tensor([self.scale], dtype=torch.float64, device="cpu")
-        return add_prefix("field", with_role(tensors, Role.SHARED))
+        parts = {
+            "network": self.network.state_dict(),
+            "sources": vars(self.sources),
+            "body": vars(dataclasses.replace(self.body)),  # without what it keeps
+        }
+        scale = torch.tensor([self.scale], dtype=torch.float64, device="cpu")
+        state = with_role({"numbers": scale}, Role.SHARED)
+        for name, tensors in parts.items():
+            state |= add_prefix(name, with_role(tensors, Role.SHARED))
+        return add_prefix("field", state)
 
     def render_camera(
         self, camera: Cameras, time: float, options: Any

@@ -28,6 +28,7 @@ from dyngs.data.geometry import camera_center
 from dyngs.data.loader import Image
 from dyngs.human.avatar.observations import project_points
 from dyngs.human.predict.people import image_planes, sample_maps
+from dyngs.models.volume import camera_rays
 
 MIN_ANGLE, MAX_ANGLE = 5.0, 50.0
 """Allowed angle between the view axes of a pair, degrees; 45 in the paper."""
@@ -260,18 +261,15 @@ def _at_size(image: Image, person_px: int) -> Image:
             "`dyngs docs people`"
         )
     rows = (image.alpha > MIN_ALPHA).any(1).nonzero()
-    return image.downscaled(max(1, int(rows.max() - rows.min() + 1) // person_px))
+    return image.downscaled(max(1, int(rows[-1] - rows[0] + 1) // person_px))
 
 
 def _box(image: Image, rotation: Tensor) -> Tensor:
     """Return the extent in x and y (2, 2) of the person in the rotated camera, at depth 1."""
-    assert image.alpha is not None
-    rows, columns = (image.alpha > MIN_ALPHA).nonzero(as_tuple=True)
-    pixels = torch.stack([columns + 0.5, rows + 0.5, torch.ones_like(rows)], dim=1).double()
-    camera = image.cameras
-    inverse = torch.linalg.inv(camera.intrinsics[0].double())
-    rays = pixels @ inverse.T @ camera.cam_from_world[0, :3, :3].double() @ rotation.T
-    flat = rays[:, :2] / rays[:, 2:]
+    pixels = (image_planes(image)[3].flatten() > MIN_ALPHA).nonzero()[:, 0]
+    rays, _ = camera_rays(image.cameras.to(dtype=torch.float64), pixels)
+    local = rays.directions @ rotation.T
+    flat = local[:, :2] / local[:, 2:]
     return torch.stack([flat.amin(0), flat.amax(0)], dim=1)
 
 
