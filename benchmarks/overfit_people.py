@@ -51,8 +51,7 @@ from dyngs.study.report import csv_text
 KINDS = ("keypoint_nerf", "eg_human_nerf")
 VARIANTS: dict[str, tuple[str, ...]] = {
     "preset": (),
-    "between": ("model.training_views=between",),
-    "rays": ("model.training_views=between", "model.supersampling=2"),
+    "rays": ("model.supersampling=2",),
 }
 """Overrides of the presets."""
 FAR = 1e3  # depth of the background, m

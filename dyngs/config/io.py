@@ -93,7 +93,7 @@ REMOVED_MODEL_KEYS: dict[str, dict[str, object]] = {
     },
     "nerf": {"width": 128, "coarse": 32, "fine": 32, "rays": 256},  # sizes=cpu
     "gps": {"widths": [24, 40, 64]},
-    "keypoint_nerf": {"features": 32, "width": 64, "step": 0.015},
+    "keypoint_nerf": {"features": 32, "width": 64, "step": 0.015, "training_views": "any"},
     "eg_human_nerf": {
         "features": 32,
         "width": 64,
@@ -101,6 +101,7 @@ REMOVED_MODEL_KEYS: dict[str, dict[str, object]] = {
         "srdf_weight": 0.2,
         "boundaries": True,
         "visibility": True,
+        "training_views": "any",
         **_REMOVED_FIELD_KEYS,
     },
     "predicted_field": _REMOVED_FIELD_KEYS,

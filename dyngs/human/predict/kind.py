@@ -40,11 +40,6 @@ class FieldPredictorModel(FieldKeys):
         le=16,
         description="input images per person; training examples have 2 to this number",
     )
-    training_views: Literal["any", "between"] = Field(
-        default="any",
-        description="training examples; any: random or evenly spread input images and any other "
-        "image, between: two input images at most 50 degrees apart and one between them",
-    )
     patch: int = Field(
         default=32,
         ge=8,

@@ -26,13 +26,11 @@ from dyngs.human.predict.fields.eg_human_nerf import EgHumanNerf
 from dyngs.human.predict.fields.keypoint_nerf import AROUND, KeypointNerf
 from dyngs.human.predict.fields.network import EncodedPerson, FieldNetwork
 from dyngs.human.predict.gps.rectification import (
-    MAX_ANGLE,
     MIN_ANGLE,
     angle_between_views,
     rings_of_views,
     spread,
     spread_around_person,
-    training_pairs,
 )
 from dyngs.human.predict.kind import PredictedFieldModel
 from dyngs.human.predict.people import (
@@ -242,10 +240,7 @@ class FieldLearner(CaptureLearner[FieldNetwork, Person]):
 
     def _views(self, person: Person, generator: torch.Generator) -> tuple[list[int], int]:
         """Choose source views of one time step, every other time evenly around the person, and a
-        target view; or a pair and a view between."""
-        if self.section.training_views == "between":
-            pair, between = random_item(training_pairs(person.views), generator)
-            return list(pair), random_item(between, generator)
+        target view."""
         rings = [ring for ring in rings_of_views(person.views) if len(ring) > FEWEST_VIEWS]
         ring = random_item(rings, generator)
         max_count = min(self.section.source_views, len(ring) - 1)
@@ -261,11 +256,6 @@ class FieldLearner(CaptureLearner[FieldNetwork, Person]):
     def open_person(self, data: DataConfig) -> Person:
         """Return a person to train on. Raises DyngsError: too few views, or no depth maps."""
         captured = read_captured_person(data, load_template(HumanModel(body=self.section.body)))
-        if self.section.training_views == "between" and not training_pairs(captured.views):
-            raise DyngsError(
-                f"{data.root}: no view lies between two others at most {MAX_ANGLE:g} degrees "
-                "apart; use model.training_views=any"
-            )
         if all(len(ring) <= FEWEST_VIEWS for ring in rings_of_views(captured.views)):
             raise DyngsError(f"{data.root}: training needs a time step with three or more views")
         if self.network.needs_depth and any(view.depth_path is None for view in captured.views):

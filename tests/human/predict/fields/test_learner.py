@@ -12,17 +12,13 @@ import torch
 from PIL import Image
 from refused import error_line
 from stopped import stopped
-from tiny_field_people import NETWORKS, field_config, field_people
+from tiny_field_people import NETWORKS, field_config
 
 from dyngs.api.predict import predict
 from dyngs.api.train import train
-from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
-from dyngs.human.body.body_reader import default_template
-from dyngs.human.predict.fields.prediction import FieldLearner, PredictedField
-from dyngs.human.predict.gps.rectification import angle_between_views
-from dyngs.human.predict.people import read_captured_person
+from dyngs.human.predict.fields.prediction import PredictedField
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
 from dyngs.training.prediction import network_trainer
 
@@ -64,46 +60,22 @@ def test_training_lowers_the_error(folder: Path, tmp_path: Path, kind: str) -> N
     assert error() < 0.9 * before
 
 
-ALTERNATIVES = {"training_views": "between", "patch": 12, "supersampling": 2}
-
-
-@pytest.fixture(scope="module")
-def ring(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """One person before 16 cameras, so that views lie between neighbours."""
-    return field_people(tmp_path_factory.mktemp("ring") / "people", people=1, cameras=16)
+ALTERNATIVES = {"patch": 12, "supersampling": 2}
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_other_keys_resume_predict_and_restore(ring: Path, tmp_path: Path, kind: str) -> None:
-    whole = train(field_config(kind, ring, tmp_path / kind, ALTERNATIVES))
-    config = field_config(kind, ring, tmp_path / "parts", ALTERNATIVES)
+def test_other_keys_resume_predict_and_restore(folder: Path, tmp_path: Path, kind: str) -> None:
+    whole = train(field_config(kind, folder, tmp_path / kind, ALTERNATIVES))
+    config = field_config(kind, folder, tmp_path / "parts", ALTERNATIVES)
     resumed = train(config, resume_from=stopped(config, 2))
     assert checkpoint_paths(resumed)[-1].read_bytes() == checkpoint_paths(whole)[-1].read_bytes()
-    made = predict(whole, ring / "s0000" / "p000000", tmp_path / "two", 2)
+    made = predict(whole, second_person(folder), tmp_path / "two", 2)
     found = load_run(made.run_dir)
     assert isinstance(found.renderable, PredictedField)
     for name, value in ALTERNATIVES.items():
         if name in type(found.config.model).model_fields:
             assert getattr(found.config.model, name) == value
             assert getattr(found.renderable.network.keys, name) == value
-
-
-def test_examples_between_two_views_are_of_neighbours(
-    ring: Path, folder: Path, tmp_path: Path
-) -> None:
-    config = field_config("keypoint_nerf", ring, tmp_path, ALTERNATIVES)
-    learner: FieldLearner = network_trainer(config).learner  # pyright: ignore[reportAssignmentType]
-    person = read_captured_person(DataConfig(root=ring / "s0000" / "p000000"), default_template())
-    views = person.views
-    for seed in range(20):
-        (left, right), target = learner._views(person, torch.Generator().manual_seed(seed))
-        apart = angle_between_views(views[left], views[right])
-        assert apart < 50
-        around = [angle_between_views(views[i], views[target]) for i in (left, right)]
-        assert min(around) > 5
-        assert sum(around) < apart + 10
-    with pytest.raises(DyngsError, match=r"use model\.training_views=any"):
-        network_trainer(field_config("keypoint_nerf", folder, tmp_path, ALTERNATIVES))
 
 
 def test_a_prediction_is_a_run(
