@@ -186,10 +186,24 @@ class FieldPredictor(Predictor[FieldNetwork]):
     """Predicts the radiance field of one person."""
 
     def __init__(
-        self, config: Config, network: FieldNetwork, person: Person, data: DataConfig
+        self,
+        config: Config,
+        checkpoint: Checkpoint,
+        data: DataConfig,
+        log: Callable[[str], None],
+        on_progress: ProgressCallback,
     ) -> None:
-        super().__init__(config, network, person.views, data)
-        self._person = person
+        """Load the network of ``checkpoint`` and the person of ``data``; fit the body if needed.
+
+        ``log`` and ``on_progress`` receive messages and progress of that fit.
+        """
+        model: Any = config.model
+        network = NETWORKS[model.kind](torch.Generator(), model)
+        load_weights(network, checkpoint)
+        if model.body is None:
+            data = ensure_fitted_body(data, only_if_needed=True, log=log, on_progress=on_progress)
+        self._person = read_captured_person(data, load_template(HumanModel(body=model.body)))
+        super().__init__(config, network, self._person.views, data)
 
     def chosen(self, count: int) -> list[int]:
         return spread_around_person(self.views, count)
@@ -279,22 +293,4 @@ def learner(config: Config, generator: torch.Generator) -> FieldLearner:
     return FieldLearner(config, NETWORKS[config.model.kind](generator, config.model))
 
 
-def predictor(
-    config: Config,
-    checkpoint: Checkpoint,
-    data: DataConfig,
-    log: Callable[[str], None],
-    on_progress: ProgressCallback,
-) -> Predictor[Any]:
-    """Return the network of ``checkpoint`` with the person of ``data``; the body is fitted if
-    needed.
-
-    ``log`` and ``on_progress`` receive messages and progress of that fit.
-    """
-    model: Any = config.model
-    network = NETWORKS[model.kind](torch.Generator(), model)
-    load_weights(network, checkpoint)
-    if model.body is None:
-        data = ensure_fitted_body(data, only_if_needed=True, log=log, on_progress=on_progress)
-    person = read_captured_person(data, load_template(HumanModel(body=model.body)))
-    return FieldPredictor(config, network, person, data)
+predictor = FieldPredictor

@@ -235,20 +235,22 @@ def observe_texels(person: AtlasPerson, images: Sequence[Image]) -> TexelMaps:
             to_edge = torch.where(
                 in_frame, sampled[:, 4] * pixel / pose.scale, MAX_SILHOUETTE_DISTANCE
             )
-            one = [cosine, weight * covered, covered > 0.5, in_frame, to_edge]
-            colours = weight[:, None] * sampled[:, :3]
-            observed.append(torch.cat([colours, torch.stack(one, dim=1)], dim=1))
-    maps = torch.stack(observed).unflatten(0, (len(images), -1))  # (V, K, P, 8)
-    seen = maps[..., 3].amax(0)
-    to_edge = maps[..., 7].amin(0)
-    colour, _, weight, inside, in_frames, _ = maps.sum(0).split((3, 1, 1, 1, 1, 1), dim=-1)
-    rgb = (colour / weight.clamp_min(1e-6)).clamp(0, 1)
-    fraction = torch.where(in_frames > 0, inside / in_frames.clamp_min(1), 1.0)
+            colour = weight[:, None] * sampled[:, :3]
+            is_inside = covered > 0.5
+            observed.append((colour, weight * covered, cosine, is_inside, in_frame, to_edge))
+    # Each (V, K, P, ...)
+    colour, weight, cosine, is_inside, in_frame, to_edge = (
+        torch.stack(x).unflatten(0, (len(images), -1)) for x in zip(*observed, strict=True)
+    )
+    rgb = (colour.sum(0) / weight.sum(0).clamp_min(1e-6)[..., None]).clamp(0, 1)
+    seen = cosine.amax(0)
+    in_frames = in_frame.sum(0)
+    fraction = torch.where(in_frames > 0, is_inside.sum(0) / in_frames.clamp_min(1), 1.0)
     return TexelMaps(
         rgb,
         seen,
-        fraction[..., 0],
-        to_edge.clamp(-MAX_SILHOUETTE_DISTANCE, MAX_SILHOUETTE_DISTANCE),
+        fraction,
+        to_edge.amin(0).clamp(-MAX_SILHOUETTE_DISTANCE, MAX_SILHOUETTE_DISTANCE),
         offsets[0],
         fill_unseen_colours(person.texels, rgb[0], seen[0]),
         len(images),

@@ -454,10 +454,18 @@ class GpsPredictor(Predictor[GpsNetwork]):
     """Predicts the surface seen by pairs of neighbouring views."""
 
     def __init__(
-        self, config: Config, network: GpsNetwork, capture: Capture, data: DataConfig
+        self,
+        config: Config,
+        checkpoint: Checkpoint,
+        data: DataConfig,
+        log: Callable[[str], None],
+        on_progress: ProgressCallback,
     ) -> None:
-        super().__init__(config, network, capture.splits["train"], data)
-        self._capture = capture
+        """Load the network of ``checkpoint`` and the capture of ``data``."""
+        network = GpsNetwork(torch.Generator(), config.model)
+        load_weights(network, checkpoint)
+        self._capture = _with_silhouettes(data)
+        super().__init__(config, network, self._capture.splits["train"], data)
 
     def chosen(self, count: int) -> list[int]:
         return best_pair(self.views) if count == 2 else spread_around_person(self.views, count)
@@ -580,14 +588,4 @@ def learner(config: Config, generator: torch.Generator) -> GpsLearner:
     return GpsLearner(config, GpsNetwork(generator, config.model))
 
 
-def predictor(
-    config: Config,
-    checkpoint: Checkpoint,
-    data: DataConfig,
-    log: Callable[[str], None],
-    on_progress: ProgressCallback,
-) -> Predictor[Any]:
-    """Return the network of ``checkpoint`` with the capture of ``data``."""
-    network = GpsNetwork(torch.Generator(), config.model)
-    load_weights(network, checkpoint)
-    return GpsPredictor(config, network, _with_silhouettes(data), data)
+predictor = GpsPredictor
