@@ -6,12 +6,21 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+import torch
+
 from dyngs.config import Config, DataConfig
+from dyngs.core.conventions import ignore_progress
 from dyngs.human.body.body import BodyTemplate
 from dyngs.human.body.body_reader import default_template
 from dyngs.human.keys import HumanPredictorModel
-from dyngs.human.predict.ghg.network import AtlasPerson, read_atlas_person
+from dyngs.human.predict.ghg.network import (
+    AtlasNetwork,
+    AtlasPerson,
+    PersonPredictor,
+    read_atlas_person,
+)
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
+from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
 
 TINY = HumanOptions(size=32, num_frames=1, num_pose_frames=1, num_cameras=8, num_test=1, samples=1)
 NET = HumanPredictorModel(
@@ -37,6 +46,17 @@ def people(folder: Path, seeds: tuple[int, ...], options: HumanOptions = TINY) -
 def person(capture: Path, model: HumanPredictorModel = NET) -> AtlasPerson:
     """The person of one capture."""
     return read_atlas_person(DataConfig.model_validate({"root": capture}), model, body())
+
+
+def untrained_predictor(capture: Path) -> PersonPredictor:
+    """An untrained network with the person of one capture; mean colours are grey."""
+    weights = AtlasNetwork(NET, torch.Generator().manual_seed(0)).state_dict()
+    tensors = {f"model.network.{name}": x for name, x in weights.items()}
+    tensors["model.mean"] = torch.full((3, NET.resolution, NET.resolution), 0.5)
+    info = CheckpointInfo(0, 1.0, (0.0, 0.0, 0.0), "white", "classic")
+    values = {"data": {"root": capture}, "model": NET, "train": {"alpha_weight": 0.1}}
+    whole = Config.model_validate(values)
+    return PersonPredictor(whole, Checkpoint(info, tensors), whole.data, print, ignore_progress)
 
 
 def config(folder: Path, run: Path, **changes: object) -> Config:

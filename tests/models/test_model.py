@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from moving_scene import camera
-from tiny_people import NET, people, person
+from tiny_people import people, untrained_predictor
 from toy_plugin import installed
 
 from dyngs.config import Config
@@ -17,7 +17,6 @@ from dyngs.config.kinds import kind_names, section_of_kind
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import Role
 from dyngs.gaussians.scene import GaussianScene, require_gaussians
-from dyngs.human.predict.ghg.network import AtlasNetwork, PersonPredictor
 from dyngs.models.checkpoint import Checkpoint, CheckpointInfo, restore_model
 from dyngs.models.kind import HasGaussians, PredictsScenes, capability, find_kind
 from dyngs.models.prediction import Predictor
@@ -184,10 +183,7 @@ def test_a_network_is_no_scene_but_predicts_one(name: str) -> None:
 
 def test_a_predictor_makes_a_scene_of_views(tmp_path: Path) -> None:
     root = people(tmp_path, (1,)) / "p1"
-    network = AtlasNetwork(NET, torch.Generator().manual_seed(0))
-    mean = torch.full((3, 32, 32), 0.5)
-    config = Config.model_validate({"data": {"root": root}, "model": NET})
-    predictor: Predictor = PersonPredictor(config, network, mean, person(root), config.data)
+    predictor: Predictor = untrained_predictor(root)
     one = predictor.predict([0])
     three = predictor.predict([0, 3, 6])
     for scene in (one, three):

@@ -510,15 +510,24 @@ class PersonPredictor(Predictor[AtlasNetwork]):
     def __init__(
         self,
         config: Config,
-        network: AtlasNetwork,
-        mean: Tensor,
-        person: AtlasPerson,
+        checkpoint: Checkpoint,
         data: DataConfig,
+        log: Callable[[str], None],
+        on_progress: ProgressCallback,
     ) -> None:
-        """``mean`` (3, S, S) are the mean colours of the training people."""
-        super().__init__(config, network, person.person.views, data)
-        self.mean = mean
-        self._person = person
+        """Load the network of ``checkpoint`` and the person of ``data``; fit the body if needed.
+
+        ``log`` and ``on_progress`` receive messages and progress of that fit.
+        """
+        model: Any = config.model
+        network = AtlasNetwork(model, torch.Generator())
+        self.mean = load_network(network, checkpoint, model.resolution)
+        options = human_options(model)
+        data = ensure_fitted_body(
+            data, options, only_if_needed=True, log=log, on_progress=on_progress
+        )
+        self._person = read_atlas_person(data, model, load_template(options))
+        super().__init__(config, network, self._person.person.views, data)
 
     def chosen(self, count: int) -> list[int]:
         return spread_views(self._person, count)
@@ -622,26 +631,7 @@ class AtlasLearner(Learner[AtlasNetwork]):
 learner = AtlasLearner
 
 
-def predictor(
-    config: Config,
-    checkpoint: Checkpoint,
-    data: DataConfig,
-    log: Callable[[str], None],
-    on_progress: ProgressCallback,
-) -> Predictor[Any]:
-    """Return the network of ``checkpoint`` with the person of ``data``; the body is fitted if
-    needed.
-
-    ``log`` and ``on_progress`` receive messages and progress of that fit.
-    """
-    model: Any = config.model
-    network = AtlasNetwork(model, torch.Generator())
-    mean = load_network(network, checkpoint, model.resolution)
-    data = ensure_fitted_body(
-        data, human_options(model), only_if_needed=True, log=log, on_progress=on_progress
-    )
-    person = read_atlas_person(data, model, load_template(human_options(model)))
-    return PersonPredictor(config, network, mean, person, data)
+predictor = PersonPredictor
 
 
 def load_network(network: AtlasNetwork, checkpoint: Checkpoint, resolution: int) -> Tensor:
