@@ -62,8 +62,6 @@ class HumanScene(GaussianScene, Posable):
     shapes: PoseBlendShapes | None = None  # of the template
     # Clip to play instead of the training clip; only shared corrections are applied to it.
     replacement_clip: MotionClip | None = None
-    # (N,) in [0, 1], confidence that colours were observed and not filled; None: not measured
-    seen: Tensor | None = None
 
     @staticmethod
     def from_state(gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> HumanScene:
@@ -92,7 +90,6 @@ class HumanScene(GaussianScene, Posable):
                 learned
             ),
             shapes=shapes,
-            seen=tensors.get("seen"),
         )
 
     @property
@@ -108,10 +105,6 @@ class HumanScene(GaussianScene, Posable):
     def rows(self) -> Tensor:
         """All rows: a person moves as a whole."""
         return torch.arange(len(self), device=self.gaussians.means.device)
-
-    @property
-    def num_moving(self) -> int:
-        return len(self)
 
     @property
     def num_motion_values(self) -> int:
@@ -217,13 +210,7 @@ class HumanScene(GaussianScene, Posable):
             gaussians=self.gaussians.apply_edit(edit),
             anchors=self.anchors.select(edit.source),
             learned=self.learned.apply_edit(Role.PER_GAUSSIAN, edit),
-            seen=None if self.seen is None else self.seen[edit.source],
         )
-
-    def part(self, which: str) -> HumanScene:
-        """Return all Gaussians or none: a person moves as a whole."""
-        count = len(self) if (which == "static") == self.is_static else 0
-        return self.select(torch.arange(count, device=self.gaussians.means.device))
 
     def with_motion(self, clip: MotionClip) -> HumanScene:
         """Return the same person playing another clip.
@@ -289,7 +276,6 @@ class HumanScene(GaussianScene, Posable):
     def drawing_state(self) -> State:
         """Return the tensors needed for rendering, with skinning weight corrections applied."""
         state = super().drawing_state()
-        state.pop("model.seen", None)
         corrections = state.pop("model.learned.weights").tensor
         if bool(corrections.any()):
             fractions = self.anchors.weights * corrections.exp()
@@ -303,8 +289,6 @@ class HumanScene(GaussianScene, Posable):
         skeleton = self.skeleton
         state = add_prefix("learned", self.learned.state())
         state |= add_prefix("anchors", with_role(self.anchors.tensors(), Role.PER_GAUSSIAN))
-        if self.seen is not None:
-            state["seen"] = StateTensor(self.seen, Role.PER_GAUSSIAN)
         tensors = {
             "clip.times": clip.times,
             "clip.poses": clip.poses,
@@ -377,8 +361,6 @@ def require_avatar(gaussians: Gaussians, state: Mapping[str, Tensor]) -> None:
     }
     if "learned.normals" in state:
         shapes["learned.normals"] = (n, 3)
-    if "seen" in state:
-        shapes["seen"] = (n,)
     for name, shape in shapes.items():
         require_tensor(name, state[name], shape)
     require_positive("clip.scale", state["clip.scale"])

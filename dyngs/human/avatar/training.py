@@ -380,7 +380,7 @@ class HumanTraining(SceneTraining[HumanScene]):
         message = None
         if low_fraction >= PARAMS.min_reported_fraction:
             message = f"filled {low_fraction:.0%} of the surface that few views show"
-        return replace(scene, seen=confidence), EditResult(None, changes, message=message)
+        return scene, EditResult(None, changes, message=message)
 
     def apply_edit(self, edit: TopologyEdit | None = None) -> None:
         """Discard cached neighbours after the set of Gaussians changed."""
