@@ -33,42 +33,27 @@ _SAME_PART_COSINE = 0.5
 _CANDIDATES_PER_NEIGHBOUR = 4
 
 
-def nearest_neighbours(points: Tensor, count: int = 5) -> Tensor:
-    """Return the indices (N, count) int64 of the nearest other points, nearest first.
-
-    Args:
-        points: (N, 3); points may coincide, but none is its own neighbour.
-        count: number of neighbours, limited to N - 1.
-    """
-    from scipy.spatial import KDTree
-
-    num_points = len(points)
-    count = min(count, num_points - 1)
-    if count < 1:
-        return torch.zeros(num_points, 0, dtype=torch.long, device=points.device)
-    positions = points.detach().double().cpu().numpy()
-    nearest = np.asarray(KDTree(positions).query(positions, k=count + 1)[1])
-    is_self = nearest == np.arange(num_points)[:, None]
-    # If more than ``count`` points coincide, the point itself may be missing: drop the last one.
-    is_self[~is_self.any(1), -1] = True
-    return torch.from_numpy(nearest[~is_self].reshape(num_points, count)).long().to(points.device)
-
-
 def same_part_neighbours(points: Tensor, weights: Tensor, count: int = 5) -> Tensor:
     """Return the indices (N, count) int64 of the nearest points of the same body part.
 
     Two points belong to the same part if the cosine between their skinning weights (N, J) is above
     0.5. Among the 4 ``count`` nearest points; missing neighbours are replaced by the point itself.
     """
-    candidates = nearest_neighbours(points, _CANDIDATES_PER_NEIGHBOUR * count)
+    from scipy.spatial import KDTree
+
+    positions = points.detach().double().cpu().numpy()
+    # The first rank is the point itself, or one at the same place.
+    ranks = np.arange(_CANDIDATES_PER_NEIGHBOUR * count) + 2
+    nearest = np.asarray(KDTree(positions).query(positions, k=ranks)[1])
+    indices = torch.arange(len(points), device=points.device)[:, None]
+    candidates = torch.from_numpy(nearest).long().to(points.device)
+    # SciPy marks missing neighbours by the number of points.
+    candidates = torch.where(candidates < len(points), candidates, indices)
     directions = torch.nn.functional.normalize(weights, dim=1)
-    if not candidates.shape[1]:
-        return candidates
     cosines = [
         (directions * directions.index_select(0, column)).sum(1) for column in candidates.unbind(1)
     ]
     is_other_part = torch.stack(cosines, dim=1) <= _SAME_PART_COSINE
-    indices = torch.arange(len(points), device=candidates.device)[:, None]
     order = is_other_part.int().sort(dim=1, stable=True).indices[:, :count]
     return torch.where(is_other_part, indices, candidates).gather(1, order)
 
@@ -221,14 +206,13 @@ def smooth_over_neighbours(
     gradients, over neighbours of the same body part; w falls with their distance.
     """
     from scipy.sparse import csr_array, diags_array
+    from scipy.sparse.csgraph import laplacian
     from scipy.sparse.linalg import cg
 
     count = len(values)
     given = values.detach().double().cpu().numpy()
     # Points without enough neighbours link to themselves, which has no effect.
     neighbours = same_part_neighbours(anchors.points, weights, _NEIGHBOURS)
-    if not neighbours.shape[1]:
-        return values
     distances = (anchors.points[neighbours] - anchors.points[:, None]).norm(dim=-1) / anchors.size[
         :, None
     ]
@@ -240,9 +224,8 @@ def smooth_over_neighbours(
     links = links.maximum(links.T)
     known = confidence.detach().double().cpu().numpy()
     own_weight = known / np.maximum(1 - known, _MIN_DOUBT) + _MIN_OWN_WEIGHT
-    diagonal = np.asarray(links.sum(1)).ravel() + own_weight
-    system = diags_array(diagonal) - links
-    jacobi = diags_array(1 / diagonal)
+    system = laplacian(links) + diags_array(own_weight)
+    jacobi = diags_array(1 / system.diagonal())
     columns = [
         cg(system, own_weight * x, x0=x, rtol=0, atol=_RESIDUAL, maxiter=_MAX_ITERATIONS, M=jacobi)[
             0

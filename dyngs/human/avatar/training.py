@@ -317,15 +317,13 @@ class HumanTraining(SceneTraining[HumanScene]):
         if self._neighbours is None:
             weights = scene.template_weights()
             self._neighbours = same_part_neighbours(anchors.points, weights, PARAMS.neighbours)
-        if self._neighbours.shape[1]:
-            # Each step uses one column of neighbours; squared distances are in cm^2.
-            neighbours = self._neighbours[:, step % self._neighbours.shape[1]]
-            scale = scene.clip.scale[row]
-            strain, smoothness = rigidity_errors(
-                gaussians.means, moved.means, anchors.points, neighbours, scale
-            )
-            penalties["rigidity"] = PARAMS.rigidity * strain / CENTIMETRE**2
-            penalties["smoothness"] = PARAMS.smoothness * smoothness / CENTIMETRE**2
+        # Each step uses one column of neighbours; squared distances are in cm^2.
+        neighbours = self._neighbours[:, step % PARAMS.neighbours]
+        strain, smoothness = rigidity_errors(
+            gaussians.means, moved.means, anchors.points, neighbours, scene.clip.scale[row]
+        )
+        penalties["rigidity"] = PARAMS.rigidity * strain / CENTIMETRE**2
+        penalties["smoothness"] = PARAMS.smoothness * smoothness / CENTIMETRE**2
         frame = RestPose(gaussians.means, posing.rotations[0])
         return GaussianTimeStep(moved, image.time, frame, penalties)
 

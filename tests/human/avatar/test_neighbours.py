@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
+import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 
 from dyngs.core.camera import Cameras
 from dyngs.gaussians import Gaussians
@@ -15,7 +12,6 @@ from dyngs.human.avatar.observations import (
     effective_view_counts,
     fill_unseen,
     find_mirror_gaussians,
-    nearest_neighbours,
     rigidity_errors,
     same_part_neighbours,
     smooth_over_neighbours,
@@ -27,23 +23,15 @@ from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.keys import HumanModel
 
 
-@settings(max_examples=40, deadline=None)
-@given(
-    arrays(np.float64, st.tuples(st.integers(0, 12), st.just(3)), elements=st.integers(0, 3)),
-    st.integers(1, 5),
-)
-def test_neighbours_are_the_nearest_others(positions: np.ndarray, count: int) -> None:
-    """By all distances; on a grid, so that many points coincide and are equally far."""
-    points = torch.from_numpy(positions)
-    found = nearest_neighbours(points, count)
-    columns = max(0, min(count, len(points) - 1))
-    assert found.shape == (len(points), columns)
-    apart = torch.cdist(points, points, compute_mode="donot_use_mm_for_euclid_dist")
-    for i, row in enumerate(found):
-        assert i not in row.tolist()
-        assert len(set(row.tolist())) == columns
-        others = torch.cat([apart[i, :i], apart[i, i + 1 :]]).sort().values
-        torch.testing.assert_close(apart[i, row], others[:columns])
+@pytest.mark.parametrize("num_points", [1, 3, 40])
+def test_neighbours_are_the_nearest_others_and_missing_ones_the_point_itself(
+    num_points: int,
+) -> None:
+    points = torch.rand(num_points, 3, generator=torch.Generator().manual_seed(0))
+    found = same_part_neighbours(points, torch.ones(num_points, 1))
+    nearest = torch.cdist(points, points).argsort(dim=1)[:, 1:6]
+    for i, row in enumerate(found.tolist()):
+        assert row == [*nearest[i].tolist(), *[i] * (5 - nearest.shape[1])]
 
 
 def test_no_gaussian_of_an_arm_is_linked_to_the_trunk_or_of_a_finger_to_another() -> None:
