@@ -12,11 +12,10 @@ from motion_files import random_motion
 from synthetic_bodies import model, write_npz
 
 from dyngs.core.state import move_to_device
-from dyngs.human.avatar.observations import nearest_neighbours
+from dyngs.human.avatar.observations import same_part_neighbours
 from dyngs.human.avatar.posing import (
     Skeleton,
     frame_pose,
-    pose_blend_offsets,
     pose_blend_shapes,
     pose_gaussians,
     skinning_weights,
@@ -43,11 +42,8 @@ def test_no_tensor_is_made_on_the_default_device(tmp_path: Path) -> None:
         )
         pose = frame_pose(clip.at(0.3), 0)
         weights = skinning_weights(anchors, len(body.joints))
-        offsets = pose_blend_offsets(anchors, pose, pose_blend_shapes(body))
-        found = pose_gaussians(
-            gaussians, weights, Skeleton(body.joints, body.parents), pose, offsets
-        )
-        near = nearest_neighbours(found.means)
+        found = pose_gaussians(gaussians, weights, Skeleton(body.joints, body.parents), pose)
+        near = same_part_neighbours(found.means, weights)
         network = AtlasNetwork(HumanPredictorModel(), generator)
     for tensor in (
         *found.tensors().values(),

@@ -31,7 +31,6 @@ from dyngs.gaussians import Gaussians
 from dyngs.gaussians.colour.network import ColourNetwork
 from dyngs.gaussians.levels import BLOCK, MAX_SPREAD_PX, MERGED, Block, Levels
 from dyngs.gaussians.scene import GaussianScene
-from dyngs.human.avatar.posing import frame_pose, pose_blend_offsets
 from dyngs.human.avatar.scene import HumanScene, as_human_scene
 from dyngs.ops.nodes import SPAN
 
@@ -297,11 +296,11 @@ def _add_person(
     lists.exact("clip_places", _numpy(torch.cat([clip.trans, clip.scale[:, None]], dim=1)))
     lists.quantised("clip_quats", quats, 16)
     header: dict[str, Any] = {"bones": {"parents": list(skeleton.parents)}}
-    if scene.shapes is not None:
+    shapes = scene.shapes
+    if shapes is not None:
 
         def offsets(time: float) -> Offsets:
-            found = pose_blend_offsets(scene.anchors, frame_pose(clip.at(time), 0), scene.shapes)
-            return Offsets(torch.zeros_like(scene.gaussians.means) if found is None else found)
+            return Offsets(shapes.offsets(scene.anchors, clip.at(time).rotations[0]))
 
         heads, error = fit_splines(offsets, len(clip), tolerance)
         header["curves"] = _add_curves(MotionSplines(heads, error=error), order, lists)

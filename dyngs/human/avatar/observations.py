@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,7 +24,6 @@ from dyngs.human.avatar.posing import (
     BodyPose,
     Skeleton,
     frame_pose,
-    pose_blend_offsets,
 )
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.body.skinning import apply_transforms, blend_transforms, joint_transforms
@@ -43,7 +43,7 @@ def same_part_neighbours(points: Tensor, weights: Tensor, count: int = 5) -> Ten
 
     positions = points.detach().double().cpu().numpy()
     # The first rank is the point itself, or one at the same place.
-    ranks = np.arange(_CANDIDATES_PER_NEIGHBOUR * count) + 2
+    ranks: Any = np.arange(_CANDIDATES_PER_NEIGHBOUR * count) + 2
     nearest = np.asarray(KDTree(positions).query(positions, k=ranks)[1])
     indices = torch.arange(len(points), device=points.device)[:, None]
     candidates = torch.from_numpy(nearest).long().to(points.device)
@@ -313,8 +313,10 @@ def colour_from_images(
     def observations() -> Iterator[tuple[Image, BodyPose, Tensor]]:
         for image in images:
             pose = frame_pose(scene.clip, rows[image.frame or 0])
-            offsets = pose_blend_offsets(anchors, pose, scene.shapes)
-            yield image, pose, anchors.points if offsets is None else anchors.points + offsets
+            points = anchors.points
+            if scene.shapes is not None:
+                points = points + scene.shapes.offsets(anchors, pose.rotations)
+            yield image, pose, points
 
     sh = scene.gaussians.sh.clone()
     weights = scene.template_weights()

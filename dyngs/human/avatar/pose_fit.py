@@ -22,15 +22,13 @@ from dyngs.human.avatar.posing import (
     POSE_CM,
     POSE_WEIGHT,
     BodyPose,
-    SharedCorrection,
-    corrected_clip,
     frame_pose,
     posed_joints,
 )
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.body.skinning import axis_angle_to_matrix
-from dyngs.human.motion.motion import MotionClip
+from dyngs.human.motion.motion import MotionClip, compose_rotations
 from dyngs.models.renderable import Rendering
 from dyngs.ops.adam import adam_step_
 from dyngs.ops.loss import l1_ssim_loss
@@ -54,20 +52,15 @@ class PoseComparison:
 
 def image_difference(render: Rendering, image: Image, background: Tensor, shrink: int) -> Tensor:
     """Return 0.8 L1 + 0.2 D-SSIM + 0.1 mean alpha error ()."""
-    rendered = render.rgb[0]
-    truth = image.composite(background)
     alpha = render.alpha[0]
     error = alpha - (alpha if image.alpha is None else image.alpha)
+    images = (render.rgb[0], image.composite(background), error[..., None])
     mask = image.mask
     if mask is not None:
-        rendered = rendered * mask[..., None]
-        truth = truth * mask[..., None]
-        error = error * mask
+        images = tuple(x * mask[..., None] for x in images)
         mask = downscale_image(mask[..., None], shrink)[..., 0]
-    loss = l1_ssim_loss(
-        downscale_image(rendered, shrink), downscale_image(truth, shrink), SSIM_WEIGHT, mask
-    )
-    return loss + ALPHA_WEIGHT * downscale_image(error[..., None], shrink).abs().mean()
+    rendered, truth, error = (downscale_image(x, shrink) for x in images)
+    return l1_ssim_loss(rendered, truth, SSIM_WEIGHT, mask) + ALPHA_WEIGHT * error.abs().mean()
 
 
 def silhouette_difference(
@@ -132,15 +125,14 @@ def fit_poses_to_images(
     """
     groups = group_by_time(images, indices)
     times = sorted(groups)
-    parts = [scene.played_clip.at(time) for time in times]
-    poses, trans, scale = (
-        torch.cat([getattr(x, name) for x in parts]) for name in ("poses", "trans", "scale")
+    starts = replace(
+        MotionClip.joined([scene.played_clip.at(time) for time in times]),
+        times=torch.tensor(times, dtype=torch.float64, device="cpu"),
     )
-    starts = MotionClip(torch.tensor(times, dtype=torch.float64, device="cpu"), poses, trans, scale)
     corrections: list[Tensor] = []
     counts: list[int] = []
     for row, time in enumerate(times):
-        start = frame_pose(starts.select(torch.tensor([row], device="cpu")), 0)
+        start = frame_pose(starts, row)
         time_images = [images[i] for i in groups[time]]
         guess = corrections[-1] if corrections else None
         correction, count = _fit_pose(
@@ -148,14 +140,13 @@ def fit_poses_to_images(
         )
         corrections.append(correction)
         counts.append(count)
-    fit = scene.fit
-    no_correction = SharedCorrection(torch.zeros_like(fit.turns), 0.0)
     stacked = torch.stack(corrections)
-    shifts = stacked[:, -1] * starts.scale[:, None]
-    clip = corrected_clip(no_correction, starts, stacked[:, :-1], shifts)
-    # ``with_motion`` applies the shared correction, which the fitted poses already include.
-    uncorrected = corrected_clip(SharedCorrection(-fit.turns, -fit.log_scale), clip)
-    return scene.with_motion(uncorrected), counts
+    clip = replace(
+        starts,
+        poses=compose_rotations(starts.poses, stacked[:, :-1]),
+        trans=starts.trans + stacked[:, -1] * starts.scale[:, None],
+    )
+    return scene.with_corrected_motion(clip), counts
 
 
 def group_by_time(
@@ -346,13 +337,9 @@ class PoseRefit:
     def refit_frame(self, scene: HumanScene, row: int) -> HumanScene:
         """Return the scene with row ``row`` of the training clip refitted and its corrections
         reset to 0."""
-        fitted_clip = (
-            self._fitted(scene, self._groups[row]).replacement_clip
-            if self._is_fitted(row)
-            else None
-        )
-        if fitted_clip is None:
+        if not self._is_fitted(row):
             return scene
+        fitted_clip = self._fitted(scene, self._groups[row]).replacement_clip
         clip = {"poses": scene.clip.poses.clone(), "trans": scene.clip.trans.clone()}
         with torch.no_grad():
             for name, x in clip.items():

@@ -23,7 +23,7 @@ from dyngs.human.body.atlas import Texels, atlas_texels
 from dyngs.human.body.body import BodyTemplate
 from dyngs.human.body.joints import JOINT_NAMES, mirrored_joints
 from dyngs.human.body.skinning import apply_transforms, axis_angle_to_matrix, joint_transforms
-from dyngs.human.motion.motion import MotionClip
+from dyngs.human.motion.motion import MotionClip, compose_rotations
 from dyngs.ops.device import copy_async
 from dyngs.ops.harmonics import lit
 from dyngs.ops.posing import pose_by_joints
@@ -39,11 +39,6 @@ class Light:
 
     normals: Tensor  # (N, 3) outward in the rest pose, not normalised
     factors: Tensor  # (8, 3) harmonics of degree 1 and 2, for red, green and blue
-
-
-def rest_normals(gaussians: Gaussians) -> Tensor:
-    """Return the outward normals (N, 3), in the rest pose, of the initial disc-shaped Gaussians."""
-    return rotation_matrices(gaussians.quats)[..., 2]
 
 
 def colour_asymmetry(gaussians: Gaussians, mirrored: Tensor, has_counterpart: Tensor) -> Tensor:
@@ -159,14 +154,6 @@ def blended_rotations(weights: Tensor, transforms: Tensor) -> Tensor:
     quats = quats_from_matrices(transforms[..., :3])
     signs = torch.where(quats @ quats.T < 0, -1.0, 1.0).to(weights)
     return rotation_matrices((weights * signs[weights.argmax(1)]) @ quats)
-
-
-def pose_blend_offsets(
-    anchors: Anchors, posing: BodyPose, shapes: PoseBlendShapes | None
-) -> Tensor | None:
-    """Return the pose-dependent offsets (N, 3) in the rest pose, m; None without pose blend
-    shapes."""
-    return None if shapes is None else shapes.offsets(anchors, posing.rotations)
 
 
 def rotate_sh(sh: Tensor, rotations: Tensor) -> Tensor:
@@ -433,25 +420,13 @@ def corrected_clip(
 
     Gives the same poses as ``corrected_pose``, as axis-angle vectors.
     """
-    from scipy.spatial.transform import Rotation
-
     corrections = fit.turns.expand_as(clip.poses) if poses is None else fit.turns + poses
-    clip_rotations, correction_rotations = (
-        Rotation.from_rotvec(x.detach().double().flatten(0, 1).cpu().numpy())
-        for x in (clip.poses, corrections)
-    )
-    combined = torch.from_numpy((clip_rotations * correction_rotations).as_rotvec()).to(clip.poses)
     return replace(
         clip,
-        poses=combined.view_as(clip.poses),
+        poses=compose_rotations(clip.poses, corrections.detach()),
         trans=clip.trans if trans is None else clip.trans + trans.detach(),
         scale=clip.scale * math.exp(fit.log_scale),
     )
-
-
-def corrected_skeleton(learned: Parameters, skeleton: Skeleton) -> Skeleton:
-    """Return the skeleton with learned joint positions."""
-    return Skeleton(skeleton.joints + learned["joints"], skeleton.parents)
 
 
 def symmetrize_joint_gradients(learned: Parameters) -> None:

@@ -32,11 +32,9 @@ from dyngs.human.avatar.posing import (
     Skeleton,
     corrected_clip,
     corrected_pose,
-    corrected_skeleton,
     frame_pose,
     learned_light,
     new_corrections,
-    pose_blend_offsets,
     pose_gaussians,
     skinning_weights,
 )
@@ -76,6 +74,7 @@ class HumanScene(GaussianScene, Posable):
         clip = MotionClip(**select_prefix(tensors, "clip"))
         skeleton = Skeleton(tensors["joints"], tuple(tensors["parents"].tolist()))
         learned = select_prefix(tensors, "learned")
+        corrections = new_corrections(clip, skeleton, anchors, learned.get("normals"))
         shapes = None
         if "shapes.directions" in tensors:
             shapes = PoseBlendShapes(
@@ -86,9 +85,7 @@ class HumanScene(GaussianScene, Posable):
             anchors=anchors,
             skeleton=skeleton,
             clip=clip,
-            learned=new_corrections(clip, skeleton, anchors, learned.get("normals")).with_state(
-                learned
-            ),
+            learned=corrections.with_state(learned),
             shapes=shapes,
         )
 
@@ -124,7 +121,8 @@ class HumanScene(GaussianScene, Posable):
     def learned_skeleton(self) -> Skeleton:
         """Skeleton with learned joint positions."""
         with torch.no_grad():
-            return corrected_skeleton(self.learned, self.skeleton)
+            joints = self.skeleton.joints + self.learned["joints"]
+        return replace(self.skeleton, joints=joints)
 
     @property
     def light(self) -> Light | None:
@@ -148,13 +146,12 @@ class HumanScene(GaussianScene, Posable):
     def played_clip(self) -> MotionClip:
         """The played clip with learned corrections applied."""
         if "clip" not in self._derived:
-            poses = self.learned["poses"].detach()
-            trans = self.learned["trans"].detach()
-            self._derived["clip"] = (
-                corrected_clip(self.fit, self.clip, poses, trans)
-                if self.replacement_clip is None
-                else corrected_clip(self.fit, self.replacement_clip)
-            )
+            clip = self.replacement_clip
+            own = ()
+            if clip is None:
+                clip = self.clip
+                own = (self.learned[name] for name in PER_FRAME)
+            self._derived["clip"] = corrected_clip(self.fit, clip, *own)
         return self._derived["clip"]
 
     def time_step(self, time: float | None) -> GaussianTimeStep:
@@ -181,7 +178,9 @@ class HumanScene(GaussianScene, Posable):
     def _posed(
         self, posing: BodyPose, weights: Tensor, skeleton: Skeleton, light: Light | None
     ) -> Gaussians:
-        offsets = pose_blend_offsets(self.anchors, posing, self.shapes)
+        offsets = None
+        if self.shapes is not None:
+            offsets = self.shapes.offsets(self.anchors, posing.rotations)
         return pose_gaussians(self.gaussians, weights, skeleton, posing, offsets, light)
 
     def gaussians_in_frame(
@@ -196,7 +195,8 @@ class HumanScene(GaussianScene, Posable):
             posing = frame_pose(self.clip, row)
             return self._posed(posing, template_weights, self.skeleton, None), posing
         posing = corrected_pose(self.learned, self.clip, row)
-        skeleton = corrected_skeleton(self.learned, self.skeleton)
+        joints = self.skeleton.joints + self.learned["joints"]
+        skeleton = replace(self.skeleton, joints=joints)
         weights = skinning_weights(self.anchors, len(skeleton.joints), self.learned["weights"])
         return self._posed(posing, weights, skeleton, learned_light(self.learned)), posing
 
@@ -219,6 +219,11 @@ class HumanScene(GaussianScene, Posable):
         training.
         """
         return replace(self, replacement_clip=clip)
+
+    def with_corrected_motion(self, clip: MotionClip) -> HumanScene:
+        """Return the same person playing a clip that includes the shared corrections."""
+        inverse = SharedCorrection(-self.fit.turns, -self.fit.log_scale)
+        return self.with_motion(corrected_clip(inverse, clip))
 
     def body_up_direction(self) -> Tensor:
         from dyngs.human.motion.placement import up_direction  # needs scipy
@@ -261,17 +266,11 @@ class HumanScene(GaussianScene, Posable):
             return self.with_motion(clip)
         if len(self.clip) == 1 or bool(torch.isin(clip.times, self.clip.times).all()):
             return self
-        return self.with_motion(self._with_frame_corrections(clip))
-
-    def _with_frame_corrections(self, clip: MotionClip) -> MotionClip:
-        """Apply the corrections of single training frames to another part of the same clip,
-        interpolated over time; shared ones are left to ``played_clip``."""
-        poses, trans = (
+        corrections = (
             interpolate_linearly(self.clip.times, self.learned[name].detach(), clip.times)
             for name in PER_FRAME
         )
-        corrected = corrected_clip(SharedCorrection(self.fit.turns, 0.0), clip, poses, trans)
-        return corrected_clip(SharedCorrection(-self.fit.turns, 0.0), corrected)
+        return self.with_corrected_motion(corrected_clip(self.fit, clip, *corrections))
 
     def drawing_state(self) -> State:
         """Return the tensors needed for rendering, with skinning weight corrections applied."""
@@ -340,12 +339,7 @@ def require_avatar(gaussians: Gaussians, state: Mapping[str, Tensor]) -> None:
         raise ValueError(
             f"unsupported sizes: {n} Gaussians, {terms} harmonics, {j} joints, {f} frames"
         )
-    if parents.is_floating_point() or tuple(parents.shape) != (j,):
-        raise ValueError(
-            f"'parents' must be integers of shape ({j},), got {parents.dtype} "
-            f"{tuple(parents.shape)}"
-        )
-    check_tree(tuple(parents.tolist()))
+    check_tree(tuple(require_tensor("parents", parents, (j,), torch.int64).tolist()))
     require_times("clip.times", state["clip.times"])
     shapes = {
         "joints": (j, 3),

@@ -21,7 +21,6 @@ from dyngs.human.avatar.posing import (
     new_corrections,
     pixel_size,
     pose_blend_shapes,
-    rest_normals,
     surface_gaussians,
     surface_texels,
 )
@@ -33,6 +32,7 @@ from dyngs.human.motion.motion import CapturedMotion, captured_motion
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import StartContext
 from dyngs.models.views import evaluation_background, training_cameras
+from dyngs.ops.quaternions import rotation_matrices
 
 MAX_COLOUR_VIEWS = 50  # training images that the initial colours are averaged over
 
@@ -59,7 +59,8 @@ def start(run: StartContext) -> GaussianModel:
     )
     training = HumanTraining(model, motion.frames, rate_schedule(config), views, outlines, refit)
     if model.light and model.refine and colours.network is None:
-        normals = rest_normals(scene.gaussians)
+        # The initial Gaussians are discs on the surface.
+        normals = rotation_matrices(scene.gaussians.quats)[..., 2]
         learned = new_corrections(scene.clip, scene.skeleton, scene.anchors, normals)
         scene = replace(scene, learned=learned)
     return GaussianModel(run, scene, training, build_densifier(run), colours)

@@ -24,7 +24,6 @@ from dyngs.human.avatar.posing import (
     BodyPose,
     Skeleton,
     blended_rotations,
-    pose_blend_offsets,
     pose_blend_shapes,
     pose_gaussians,
     rotate_sh,
@@ -210,7 +209,7 @@ def test_blend_shapes_of_the_template_move_texels_as_its_surface() -> None:
     weights = skinning_weights(anchors, 24)
     shapes = pose_blend_shapes(body)
     assert shapes is not None
-    offsets = pose_blend_offsets(anchors, posing, shapes)
+    offsets = shapes.offsets(anchors, posing.rotations)
     found = pose_gaussians(
         gaussians, weights, Skeleton(body.joints, body.parents), posing, offsets
     ).means
