@@ -22,7 +22,7 @@ from PIL import Image
 from splat_scenes import cloud
 
 from dyngs.core.camera import Cameras
-from dyngs.export.html.page import ELEMENT, PAGE, WrittenPage, write_page, write_page_folder
+from dyngs.export.html.page import ELEMENT, PAGE, WrittenPage, write_page
 from dyngs.gaussians.levels import LevelScene
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianScene
@@ -134,8 +134,8 @@ def levels_of_a_cloud(folder: Path, most: int | None = None) -> tuple[LevelScene
         gaussians=gaussians.replace(log_scales=gaussians.log_scales - 1), background=torch.ones(3)
     )
     view = large(camera(), 6)
-    written = write_page_folder(
-        replace(wrap_scene(still), stated_up="-y"), folder, most=most, views=(view,)
+    written = write_page(
+        replace(wrap_scene(still), stated_up="-y"), folder, most=most, views=(view,), folder=True
     )
     assert written.num_bytes == sum(file.stat().st_size for file in folder.iterdir())
     blocks = [*(f"0-{i}.bin" for i in range(4)), "1-0.bin"]

@@ -596,7 +596,7 @@ def _export_surface(arguments: argparse.Namespace) -> list[Path]:
 
 def _export_page(arguments: argparse.Namespace) -> list[Path]:
     """Write a self-contained web page, or a folder whose page streams the scene."""
-    from dyngs.export.html.page import write_page, write_page_folder
+    from dyngs.export.html.page import write_page
 
     most = arguments.max_gaussians_drawn
     if most is not None and not arguments.folder:
@@ -611,13 +611,15 @@ def _export_page(arguments: argparse.Namespace) -> list[Path]:
         where = "open it in any browser with WebGL 2"
     opened = _moved(arguments, _open(arguments))
     opened = opened if arguments.from_up is None else replace(opened, stated_up=arguments.from_up)
-    time = arguments.time or 0.0
-    title = arguments.title
-    view = arguments.view
-    if arguments.folder:
-        written = write_page_folder(opened, out, most=most, title=title, time=time, view=view)
-    else:
-        written = write_page(opened, out, title=title, time=time, view=view)
+    written = write_page(
+        opened,
+        out,
+        folder=arguments.folder,
+        most=most,
+        title=arguments.title,
+        time=arguments.time or 0.0,
+        view=arguments.view,
+    )
     print_notes((*written.notes, where))
     return [written.path]
 

@@ -45,7 +45,6 @@ from dyngs.export.html.page import (
     MOST_VIEWS,
     element_script,
     write_page,
-    write_page_folder,
 )
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions
@@ -202,9 +201,9 @@ def test_only_a_new_folder_is_written_and_no_moving_scene(tmp_path: Path) -> Non
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine").touch()
     with pytest.raises(DyngsError, match="exists already"):
-        write_page_folder(still, tmp_path / "full")
+        write_page(still, tmp_path / "full", folder=True)
     with pytest.raises(DyngsError, match="need a static scene"):
-        write_page_folder(wrap_scene(sliding_scene()), tmp_path / "new", most=9)
+        write_page(wrap_scene(sliding_scene()), tmp_path / "new", most=9, folder=True)
     assert [path.name for path in tmp_path.rglob("*")] == ["full", "mine"]
 
 
@@ -326,8 +325,8 @@ def test_a_long_clip_is_fetched_as_it_is_played(
     view = large(onlooker())
     monkeypatch.setattr(scene_data, "CHUNK_BYTES", 60)
     scene = replace(scene, background=torch.ones(3))
-    written = write_page_folder(
-        replace(wrap_scene(scene), stated_up="-y"), tmp_path / "clip", views=(view,)
+    written = write_page(
+        replace(wrap_scene(scene), stated_up="-y"), tmp_path / "clip", views=(view,), folder=True
     )
     curves = written.header["curves"]
     count = -(-(curves["points"] - 3) // curves["chunk"])

@@ -78,71 +78,57 @@ def write_page(
     opened: OpenedScene,
     path: Path,
     *,
-    title: str | None = None,
-    time: float = 0.0,
-    views: Sequence[Cameras] = (),
-    view: str | None = None,
-) -> WrittenPage:
-    """Write a scene as a single HTML file, atomically.
-
-    Args:
-        title: shown in a corner and in the title bar. None uses the name of the run or file.
-        time: initial scene time.
-        views: cameras offered on the page, each a batch of one, the first one initially. Empty uses
-            those of the capture, or an orbit.
-        view: name or index of the initial view of the capture, see ``select_view``.
-    """
-    collect_inputs(opened).require_output(path)
-    lists = PackedArrays()
-    header = _header(opened, time, _initial_views(opened, views, view), lists)
-    text = _assemble_page(opened, header, lists, title)
-    write_text(path, text)
-    return WrittenPage(path, len(text.encode()), header, _notes(opened, header))
-
-
-def write_page_folder(
-    opened: OpenedScene,
-    folder: Path,
-    *,
+    folder: bool = False,
     most: int | None = None,
     title: str | None = None,
     time: float = 0.0,
     views: Sequence[Cameras] = (),
     view: str | None = None,
 ) -> WrittenPage:
-    """Write a scene as a new folder for a web server: ``PAGE``, ``ELEMENT`` for other pages, and
-    data.
+    """Write a scene as a single HTML file or a folder for a web server, atomically.
 
-    Blocks of levels of detail of a static scene, and time chunks of a long motion, are fetched when
-    needed.
+    A folder holds ``PAGE``, ``ELEMENT`` for other pages, and data: blocks of levels of detail of a
+    static scene, and time chunks of a long motion, are fetched when needed.
 
     Args:
-        most: largest number of Gaussians rendered of a static scene. Others as for ``write_page``.
+        folder: write a new folder.
+        most: largest number of Gaussians rendered of a static scene, for a folder.
+        title: shown in a corner and in the title bar. None uses the name of the run or file.
+        time: initial scene time.
+        views: cameras offered on the page, each a batch of one, the first one initially. Empty uses
+            those of the capture, or an orbit.
+        view: name or index of the initial view of the capture, see ``select_view``.
 
     Raises:
         DyngsError: ``most`` for a moving scene, or the folder exists already.
     """
-    require_new_folder(folder)
-    lists = PackedArrays(chunked=True)
-    cameras = _initial_views(opened, views, view)
-    if most is not None or opened.renderable.has_levels:
+    collect_inputs(opened).require_output(path)
+    if folder:
+        require_new_folder(path)
+    lists = PackedArrays(chunked=folder)
+    cameras, target = _initial_views(opened, views, view)
+    if folder and (most is not None or opened.renderable.has_levels):
         levelled = LevelScene.from_scene(opened.renderable, most)
         colour = levelled.scene.colour
         header = add_levels(levelled.levels, colour, lists) | _render_header(levelled.options)
         header["levels"]["most"] = most
-        header |= _view_header(opened, time, *cameras)
         parts = block_files(levelled.levels, includes_harmonics=colour is None)
     else:
-        header = _header(opened, time, cameras, lists)
+        header = _scene_header(opened, cameras[0], target, lists)
         parts = ((f"{i}.bin", chunk.deflated()) for i, chunk in enumerate(lists.chunks or ()))
+    header |= _view_header(opened, time, cameras, target)
     text = _assemble_page(opened, header, lists, title)
-    with atomic_folder(folder) as started:
+    notes = _notes(opened, header)
+    if not folder:
+        write_text(path, text)
+        return WrittenPage(path, len(text.encode()), header, notes)
+    with atomic_folder(path) as started:
         write_text(started / PAGE, text)
         write_text(started / ELEMENT, element_script())
         for name, data in parts:
             (started / name).write_bytes(data)
         size = sum(file.stat().st_size for file in started.iterdir())
-    return WrittenPage(folder / PAGE, size, header, _notes(opened, header))
+    return WrittenPage(path / PAGE, size, header, notes)
 
 
 def _notes(opened: OpenedScene, header: dict[str, Any]) -> tuple[str, ...]:
@@ -167,25 +153,19 @@ def _notes(opened: OpenedScene, header: dict[str, Any]) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def _header(
-    opened: OpenedScene,
-    time: float,
-    cameras: tuple[Sequence[Cameras], list[float]],
-    lists: PackedArrays,
+def _scene_header(
+    opened: OpenedScene, first: Cameras, target: list[float], lists: PackedArrays
 ) -> dict[str, Any]:
-    views, target = cameras
+    """Add the data of a scene to ``lists`` and return its header fields."""
     found = opened.renderable.page_data()
     if found is not None:
         header, own = found
         for name, (rows, bits) in own.items():
             lists.quantised(name, rows.detach().float().numpy(), bits)
-    else:
-        apart = float((views[0].centers[0] - views[0].centers.new_tensor(target)).norm())
-        pixel = (apart or 1.0) / float(views[0].intrinsics[0, 1, 1])
-        header = add_scene(opened.scene, lists, TOLERANCE * pixel) | _render_header(
-            opened.scene.options
-        )
-    return header | _view_header(opened, time, views, target)
+        return header
+    distance = float((first.centers[0] - first.centers.new_tensor(target)).norm()) or 1.0
+    tolerance = TOLERANCE * distance / float(first.intrinsics[0, 1, 1])
+    return add_scene(opened.scene, lists, tolerance) | _render_header(opened.scene.options)
 
 
 def _initial_views(
@@ -225,7 +205,15 @@ def _view_header(
         "up": upward.tolist(),
         "seconds": opened.seconds,
         "time": time,
-        "views": [_view(camera) for camera in views],
+        "views": [
+            {
+                "camFromWorld": camera.cam_from_world[0].flatten().tolist(),
+                "intrinsics": camera.intrinsics[0, [0, 1, 0, 1], [0, 1, 2, 2]].tolist(),
+                "width": camera.width,
+                "height": camera.height,
+            }
+            for camera in views
+        ],
     }
 
 
@@ -234,16 +222,6 @@ def _render_header(options: RenderOptions) -> dict[str, Any]:
         "eps2d": options.eps2d,
         "alphaMin": options.alpha_min,
         "antialiased": options.mode == RasterizeMode.ANTIALIASED,
-    }
-
-
-def _view(camera: Cameras) -> dict[str, Any]:
-    (k,) = camera.intrinsics.tolist()
-    return {
-        "camFromWorld": camera.cam_from_world[0].flatten().tolist(),
-        "intrinsics": [k[0][0], k[1][1], k[0][2], k[1][2]],
-        "width": camera.width,
-        "height": camera.height,
     }
 
 
