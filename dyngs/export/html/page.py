@@ -109,10 +109,10 @@ def write_page(
     cameras, target = _initial_views(opened, views, view)
     if folder and (most is not None or opened.renderable.has_levels):
         levelled = LevelScene.from_scene(opened.renderable, most)
-        colour = levelled.scene.colour
-        header = add_levels(levelled.levels, colour, lists) | _render_header(levelled.options)
+        header = add_levels(levelled.levels, levelled.scene.colour, lists)
+        header |= _render_header(levelled.options)
         header["levels"]["most"] = most
-        parts = block_files(levelled.levels, includes_harmonics=colour is None)
+        parts = block_files(levelled.levels)
     else:
         header = _scene_header(opened, cameras[0], target, lists)
         parts = ((f"{i}.bin", chunk.deflated()) for i, chunk in enumerate(lists.chunks or ()))

@@ -122,11 +122,11 @@ def add_scene(scene: GaussianScene, lists: PackedArrays, tolerance: float) -> di
     elif moved is not None:
         motion, gaussians = _add_motion(moved, order, lists, tolerance)
         header |= motion
-    includes_harmonics = scene.colour is None
-    header |= _add_gaussians(
-        gaussians.select(order).detach(), lists, includes_harmonics=includes_harmonics
-    )
-    return header if scene.colour is None else header | _add_network(scene.colour, lists)
+    gaussians = gaussians.select(order).detach()
+    if scene.colour is not None:
+        gaussians = gaussians.replace(sh=gaussians.sh[:, :1])
+        header |= _add_network(scene.colour, lists)
+    return header | _add_gaussians(gaussians, lists)
 
 
 def add_levels(levels: Levels, colour: ColourNetwork | None, lists: PackedArrays) -> dict[str, Any]:
@@ -136,16 +136,16 @@ def add_levels(levels: Levels, colour: ColourNetwork | None, lists: PackedArrays
     The page fetches the blocks itself, see ``block_numbers``.
     """
     lists.exact("blocks", np.concatenate(levels.blocks).astype(np.float32))
-    coarsest = block_numbers(levels, (len(levels.levels) - 1, 0), includes_harmonics=colour is None)
+    coarsest = block_numbers(levels, (len(levels.levels) - 1, 0))
     sizes = [len(level) for level in levels.levels]
     known = {"sizes": sizes, "block": BLOCK, "merged": MERGED, "pixels": MAX_SPREAD_PX}
-    degree = levels.levels[0].sh_degree if colour is None else 0
-    header: dict[str, Any] = {"count": sizes[0], "frames": 0, "moves": False, "degree": degree}
+    header: dict[str, Any] = {"count": sizes[0], "frames": 0, "moves": False}
+    header["degree"] = levels.levels[0].sh_degree
     header["levels"] = known | {"layout": coarsest.layout}
     return header if colour is None else header | _add_network(colour, lists)
 
 
-def block_numbers(levels: Levels, block: Block, *, includes_harmonics: bool) -> PackedArrays:
+def block_numbers(levels: Levels, block: Block) -> PackedArrays:
     """Return the arrays of a block with ``BLOCK`` rows. Missing rows are padded with transparent
     Gaussians."""
     gaussians = levels.block_gaussians(block)
@@ -153,21 +153,18 @@ def block_numbers(levels: Levels, block: Block, *, includes_harmonics: bool) -> 
     padded = gaussians.select(rows)
     padded.logit_opacities[len(gaussians) :] = -MAX_LOGIT
     lists = PackedArrays()
-    _add_gaussians(padded, lists, includes_harmonics=includes_harmonics)
+    _add_gaussians(padded, lists)
     return lists
 
 
-def block_files(levels: Levels, *, includes_harmonics: bool) -> Iterator[tuple[str, bytes]]:
+def block_files(levels: Levels) -> Iterator[tuple[str, bytes]]:
     """Yield names and contents of the files of all blocks, as requested by ``levels.js``."""
     for level, balls in enumerate(levels.blocks):
         for place in range(len(balls)):
-            numbers = block_numbers(levels, (level, place), includes_harmonics=includes_harmonics)
-            yield f"{level}-{place}.bin", numbers.deflated()
+            yield f"{level}-{place}.bin", block_numbers(levels, (level, place)).deflated()
 
 
-def _add_gaussians(
-    gaussians: Gaussians, lists: PackedArrays, *, includes_harmonics: bool
-) -> dict[str, Any]:
+def _add_gaussians(gaussians: Gaussians, lists: PackedArrays) -> dict[str, Any]:
     unit = torch.nn.functional.normalize(gaussians.quats, dim=1)
     logits = gaussians.logit_opacities.clamp(-MAX_LOGIT, MAX_LOGIT)
     lists.quantised("means", _numpy(gaussians.means), 16)
@@ -175,10 +172,9 @@ def _add_gaussians(
     lists.quantised("log_scales", _numpy(gaussians.log_scales), 8)
     lists.quantised("logit_opacities", _numpy(logits[:, None]), 8)
     lists.quantised("base", _numpy(gaussians.sh[:, 0]), 8)
-    degree = gaussians.sh_degree if includes_harmonics else 0
-    if degree:
+    if gaussians.sh_degree:
         lists.quantised("rest", _numpy(gaussians.sh[:, 1:].flatten(1)), 8)
-    return {"degree": degree}
+    return {"degree": gaussians.sh_degree}
 
 
 def _add_motion(
@@ -238,7 +234,7 @@ def _add_curves(curves: MotionSplines, order: Tensor, lists: PackedArrays) -> di
     count, points, _ = curves.heads["means"].shape
     header: dict[str, Any] = {"count": count, "points": points, "moving": len(order)}
     header["error"] = curves.error
-    has_nodes = curves.pivots is not None
+    has_nodes = curves.drivers is not None
     splines: dict[str, tuple[Tensor, int]] = {}
     for name, x in curves.heads.items():
         bits = 32 if curves.is_steep else 16 if has_nodes and name in FINE else 8
@@ -255,10 +251,11 @@ def _add_curves(curves: MotionSplines, order: Tensor, lists: PackedArrays) -> di
             chunks.append(PackedArrays())
             _add_splines(splines, rows, chunks[-1])
         header |= {"chunk": chunk, "layout": chunks[0].layout}
-    if curves.pivots is not None and curves.followed is not None and curves.fractions is not None:
-        lists.exact("pivots", _numpy(curves.pivots))
-        lists.exact("followed", curves.followed[order].numpy().astype(np.uint16))
-        lists.exact("shares", _fractions(curves.fractions[order]))
+    if curves.drivers is not None:
+        pivots, followed, fractions = curves.drivers
+        lists.exact("pivots", _numpy(pivots))
+        lists.exact("followed", followed[order].numpy().astype(np.uint16))
+        lists.exact("shares", _fractions(fractions[order]))
     if curves.windows is not None:
         lists.quantised("windows", _numpy(curves.windows[order]), 16)
         header |= {"edge": EDGE_WIDTH, "open": OPEN_WINDOW}
@@ -357,9 +354,8 @@ class MotionSplines:
 
     Attributes:
         heads: control points (S, P, size) by attribute of ``Offsets``, always with "means".
-        pivots: (S, 3) rotation centres of drivers. None if each Gaussian is its own driver.
-        followed: (M, B) drivers of each Gaussian, B = 4. None as for ``pivots``.
-        fractions: (M, B) their weights, which sum to 1. None as for ``pivots``.
+        drivers: (S, 3) rotation centres of drivers, (M, B) drivers of each Gaussian, B = 4, and
+            (M, B) their weights, which sum to 1. None if each Gaussian is its own driver.
         is_steep: control points lie far outside the visible range and are stored without
             quantisation.
         windows: (M, 2) start and end of each Gaussian's lifetime (``WindowedField``). None if all
@@ -368,9 +364,7 @@ class MotionSplines:
     """
 
     heads: dict[str, Tensor]
-    pivots: Tensor | None = None
-    followed: Tensor | None = None
-    fractions: Tensor | None = None
+    drivers: tuple[Tensor, Tensor, Tensor] | None = None
     is_steep: bool = False
     windows: Tensor | None = None
     error: float = 0.0
@@ -445,6 +439,5 @@ def _curves_of_nodes(field: ControlNodes, means: Tensor) -> MotionSplines:
     followed, fractions = (
         torch.nn.functional.pad(x, more) for x in (nodes.followed, nodes.weights(means))
     )
-    return MotionSplines(
-        _fit(field.offsets_of_nodes, field.num_pieces), nodes.positions, followed, fractions
-    )
+    heads = _fit(field.offsets_of_nodes, field.num_pieces)
+    return MotionSplines(heads, (nodes.positions, followed, fractions))

@@ -18,7 +18,6 @@ from dyngs.human.avatar.posing import frame_pose
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.body.atlas import Texels
 from dyngs.human.body.skinning import blend_transforms, joint_transforms
-from dyngs.human.motion.placement import rest_clip
 from dyngs.ops.harmonics import harmonics_basis
 from dyngs.ops.quaternions import rotation_matrices
 
@@ -82,9 +81,7 @@ def frontal_colours(scene: HumanScene, normals: Tensor) -> Tensor:
     gaussians = scene.gaussians
     seen_along = -normals
     if scene.colour is not None:
-        upright = scene.with_motion(
-            rest_clip(scene.clip, scene.skeleton.joints, scene.skeleton.parents)
-        )
+        upright = scene.at_rest()
         moment = upright.time_step(None)
         shader = upright.shader(moment)
         if shader is not None:
