@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from dyngs.core.conventions import ProgressCallback
@@ -62,9 +63,24 @@ class HumanKind(HasGaussians, HasBody):
     def play_motion(
         self, section: HumanModel, scene: Posable, info: CheckpointInfo, path: Path
     ) -> PlayedMotion:
-        from dyngs.human.avatar.play_motion import play_motion
+        from dyngs.human.avatar.scene import HumanScene
+        from dyngs.human.body.body_reader import load_template
+        from dyngs.human.motion.motion import motion_clip
+        from dyngs.human.motion.placement import place_like
+        from dyngs.human.motion.retarget import read_motion
 
-        return play_motion(section, scene, info, path)
+        if not isinstance(scene, HumanScene):
+            raise DyngsError(f"{path}: motions can only be played by avatars (model.kind=human)")
+        avatar = scene.to("cpu")
+        joints = avatar.skeleton.joints
+        motion = read_motion(path, load_template(section)).for_joints(len(joints))
+        if bool((motion.scale != 1).any()):  # fitted to images, in the place of the person
+            trans = motion.trans - motion.trans.new_tensor(info.world_offset)
+            unit = info.world_scale
+            clip = motion_clip(replace(motion, trans=trans / unit, scale=motion.scale / unit))
+        else:
+            clip = place_like(motion_clip(motion), avatar.clip, joints, avatar.skeleton.parents)
+        return PlayedMotion(avatar.with_motion(clip).to(scene.device), motion.fps, motion.notes)
 
     def read_person(self, path: Path) -> tuple[HumanModel, Posable, CheckpointInfo]:
         from dyngs.human.avatar.avatar_file import read_avatar
