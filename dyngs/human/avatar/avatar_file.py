@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from dyngs.core.conventions import RasterizeMode
-from dyngs.core.errors import DyngsError, format_one_line
+from dyngs.core.errors import DyngsError, format_one_line, wrap_read_errors
 from dyngs.core.section import ModelSection
-from dyngs.core.state import select_prefix
+from dyngs.core.state import select_prefix, strip_roles
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.scene import render_options
@@ -42,9 +42,6 @@ def write_avatar(person: Renderable, model: ModelSection, info: CheckpointInfo, 
     The format is described in docs/reference/formats.md. Raises DyngsError: the scene is not an
     avatar, its template is missing, or the file cannot be written.
     """
-    # imported here because it needs scipy, which reading an avatar does not
-    from dyngs.human.motion.placement import rest_clip
-
     scene = as_human_scene(person)
     if scene is None or not isinstance(model, HumanModel):
         raise DyngsError(
@@ -58,14 +55,16 @@ def write_avatar(person: Renderable, model: ModelSection, info: CheckpointInfo, 
             "avatar files store spherical harmonics, but this run has a colour network; train with "
             "colour.kind=sh"
         )
-    reference = rest_clip(scene.clip, scene.skeleton.joints, scene.skeleton.parents)
-    anchors = scene.anchors
-    tensors = {f"gaussians.{name}": x for name, x in scene.gaussians.tensors().items()}
-    tensors |= {f"anchors.{name}": x for name, x in anchors.tensors().items()}
+    reference = scene.at_rest().replacement_clip
+    assert reference is not None
+    tensors = {
+        name.removeprefix("model."): x
+        for name, x in strip_roles(scene.drawing_state()).items()
+        if name.startswith(("gaussians.", "model.anchors.", "model.shapes."))
+    }
     tensors |= {
-        "anchors.face": anchors.face.int(),
-        "anchors.joints": anchors.joints.to(torch.uint8),
-        "anchors.weights": scene.weights.gather(1, anchors.joints),
+        "anchors.face": scene.anchors.face.int(),
+        "anchors.joints": scene.anchors.joints.to(torch.uint8),
         "skeleton.joints": scene.learned_skeleton.joints,
         "skeleton.template_joints": scene.skeleton.joints,
         "skeleton.parents": torch.tensor(scene.skeleton.parents, device="cpu"),
@@ -75,11 +74,6 @@ def write_avatar(person: Renderable, model: ModelSection, info: CheckpointInfo, 
         "reference.trans": reference.trans[0],
         "reference.scale": reference.scale,
     }
-    if scene.shapes is not None:
-        tensors |= {
-            "shapes.directions": scene.shapes.directions.half(),
-            "shapes.faces": scene.shapes.faces.int(),
-        }
     if scene.light is not None:
         tensors |= {"light": scene.light.factors, "normals": scene.light.normals}
     file = template_path(model)
@@ -135,12 +129,8 @@ def _template_beside(path: Path, file: str, sha256: str, packaged: bool) -> Path
 
 
 def _sha256(file: Path) -> str:
-    try:
+    with wrap_read_errors(file, "it must be the body template; restore the file"):
         return hashlib.sha256(file.read_bytes()).hexdigest()
-    except OSError as error:
-        raise DyngsError(
-            f"{file}: cannot read the body template ({error.strerror}); restore the file"
-        ) from None
 
 
 def _scene(tensors: Mapping[str, Tensor]) -> HumanScene:
@@ -148,9 +138,7 @@ def _scene(tensors: Mapping[str, Tensor]) -> HumanScene:
     joints = tensors["skeleton.template_joints"]
     poses = tensors["reference.poses"][None]
     trans = tensors["reference.trans"][None]
-    stored = {
-        **{f"anchors.{name}": x for name, x in select_prefix(tensors, "anchors").items()},
-        **{f"shapes.{name}": x for name, x in select_prefix(tensors, "shapes").items()},
+    stored = dict(tensors) | {
         "joints": joints,
         "parents": tensors["skeleton.parents"],
         "clip.times": torch.zeros(1, dtype=torch.float64, device="cpu"),
