@@ -26,6 +26,7 @@ from dyngs.export.camera_paths import (
 from dyngs.export.images import OutputOptions, file_stems, write_path_images
 from dyngs.export.orbits import frame_orbit_for_points, orbit_path, path_along, spiral_path
 from dyngs.gaussians.scene import GaussianScene
+from dyngs.human.avatar.observations import project_points
 from dyngs.human.avatar.scene import as_human_scene
 from dyngs.human.body.skinning import axis_angle_to_matrix
 from dyngs.io.formats.similarity import AXES
@@ -122,13 +123,10 @@ def _with_room(scene: Renderable, path: CameraPath) -> Cameras:
     high = size.float()
     for i in evenly_spaced(len(path), ROOM_FRAMES):
         points = framing_points(scene, None if path.times is None else path.times[i]).cpu()
-        pose = cameras.cam_from_world[i].cpu()
-        local = points @ pose[:3, :3].T + pose[:3, 3]
-        pixels = local @ cameras.intrinsics[i].cpu().T
-        pixels = pixels[pixels[:, 2] > 1e-6]
-        if not len(pixels):
+        pixels, depth, _ = project_points(points, cameras.select(i))
+        places = pixels[depth > 1e-6].sort(dim=0).values
+        if not len(places):
             continue
-        places = (pixels[:, :2] / pixels[:, 2:]).sort(dim=0).values
         low = torch.minimum(low, places[int(0.01 * (len(places) - 1))])
         high = torch.maximum(high, places[math.ceil(0.99 * (len(places) - 1))])
     margin = ROOM_MARGIN * size

@@ -116,8 +116,10 @@ def _fit(
     for i, weight in enumerate(weights):
         before = _project(own, cameras.select(i), source)
         after = _project(shape, cameras.select(i), target)
-        # a view without the Gaussian has no size, and weight 0
-        ratio = (_size(before) / _size(after)).nan_to_num(0, 0, 0)
+        # Areas after the low-pass are inverse to these products. A view without the Gaussian has no
+        # area, and weight 0.
+        sharpness = [(x.factors[0, :, 0] * x.factors[0, :, 2]).abs() for x in (before, after)]
+        ratio = (sharpness[1] / sharpness[0]).nan_to_num(0, 0, 0)
         if source.mode is RasterizeMode.ANTIALIASED:
             ratio = ratio * before.compensations[0]
         ratios += weight * ratio
@@ -153,8 +155,3 @@ def _project(gaussians: Gaussians, camera: Cameras, options: RenderOptions) -> P
     return project(
         gaussians.means, gaussians.quats, gaussians.scales, opacities, camera, options.projection
     )
-
-
-def _size(projection: Projection) -> Tensor:
-    """Return the areas (N,) of splats after the low-pass, up to a factor."""
-    return 1 / (projection.factors[0, :, 0] * projection.factors[0, :, 2]).abs()

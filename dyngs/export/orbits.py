@@ -68,7 +68,7 @@ def orbit_path(
         notes = ("cameras look outwards: consider --path along instead of an orbit",)
     heights = near @ heights
     radii = np.maximum(near @ radii, smallest)
-    made = _on_circle(cameras, center, up, axis_x, azimuths, radii, heights)
+    made = cameras_on_circle(cameras, center, up, axis_x, azimuths, radii, heights)
     return CameraPath(made, notes=notes), width is None
 
 
@@ -93,7 +93,7 @@ def _full_circle(num_frames: int) -> np.ndarray:
     return 2 * np.pi * np.arange(num_frames) / max(num_frames, 1)
 
 
-def _on_circle(
+def cameras_on_circle(
     template: Cameras,
     center: np.ndarray,
     up: np.ndarray,
@@ -165,15 +165,22 @@ def frame_orbit_for_points(
     extent = max(float(np.quantile(np.linalg.norm(points - center, axis=1), 0.99)), least) or 1.0
     width, height = size
     focal = 0.5 * max(width, height) / math.tan(math.radians(25.0))
-    matrix = torch.from_numpy(pinhole_matrix(focal, focal, 0.5 * width, 0.5 * height)).float()
-    template = Cameras(torch.eye(4, device="cpu")[None], matrix[None], width, height)
+    template = pinhole_camera(focal, width, height)
     distance = 0.85 * extent / math.sin(math.atan(0.5 * min(width, height) / focal))
     elevation = math.radians(20.0)
     axis_z = unit(np.asarray(up, np.float64))
     radius = distance * math.cos(elevation)
     height = distance * math.sin(elevation)
     arm = perpendicular(axis_z)
-    return _on_circle(template, center, axis_z, arm, _full_circle(num_frames), radius, height)
+    return cameras_on_circle(
+        template, center, axis_z, arm, _full_circle(num_frames), radius, height
+    )
+
+
+def pinhole_camera(focal: float, width: int, height: int) -> Cameras:
+    """Return a camera at the origin whose principal point is in the middle of the image."""
+    matrix = torch.from_numpy(pinhole_matrix(focal, focal, 0.5 * width, 0.5 * height)).float()
+    return Cameras(torch.eye(4, device="cpu")[None], matrix[None], width, height)
 
 
 def path_along(

@@ -33,7 +33,6 @@ from dyngs.human.body.joints import JOINT_NAMES, SMPLX_ROWS
 from dyngs.human.body.mesh import vertex_normals
 from dyngs.human.body.skinning import (
     apply_transforms,
-    axis_angle_to_matrix,
     blend_transforms,
     joint_transforms,
 )
@@ -173,14 +172,12 @@ def add_animation(
     parents = rig.skeleton.parents
     clip = rotate_clip_to_y_up(scene.played_clip, scene.clip, joints)
     frames = torch.linspace(0, len(clip) - 1, min(len(clip), _FLOOR_FRAMES), device="cpu").long()
-    lowest = []
-    for row in frames.tolist():
-        posed = joint_transforms(joints, parents, axis_angle_to_matrix(clip.poses[row]))
-        heights = apply_transforms(blend_transforms(weights, posed), vertices)[:, 1].amin()
-        lowest.append(float(clip.scale[row] * heights + clip.trans[row, 1]))
+    posed = joint_transforms(joints, parents, clip.rotations[frames])
+    heights = apply_transforms(blend_transforms(weights, posed), vertices)[..., 1].amin(1)
+    floor = float((clip.scale[frames] * heights + clip.trans[frames, 1]).amin())
     root = (clip.scale[:, None] * joints[0] + clip.trans).double().numpy()
     middle = root.mean(axis=0)
-    root = root - np.array([middle[0], min(lowest), middle[2]])
+    root = root - np.array([middle[0], floor, middle[2]])
     poses = clip.poses.double().numpy()
     quats = Rotation.from_rotvec(poses.reshape(-1, 3)).as_quat().reshape(*poses.shape[:2], 4)
     quats = align_quat_signs(quats)

@@ -16,10 +16,11 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from dyngs.core.camera import Cameras
-from dyngs.data.geometry import cameras_at_poses, look_at
+from dyngs.export.orbits import cameras_on_circle, pinhole_camera
 from dyngs.export.rigged.texture import SEEN, BakedTexels
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, render
+from dyngs.human.avatar.observations import project_points
 from dyngs.human.body.atlas import Texels
 from dyngs.human.body.body import BodyTemplate
 from dyngs.human.body.mesh import rasterize
@@ -117,29 +118,19 @@ def _cameras(vertices: Tensor) -> Cameras:
     lowest = vertices.amin(0).double().numpy()
     highest = vertices.amax(0).double().numpy()
     middle = (lowest + highest) / 2
-    reach = float(np.linalg.norm(highest - lowest)) / 2
-    distance = 6 * reach
-    focal = 0.47 * _SIZE * distance / reach
-    matrix = [[focal, 0, _SIZE / 2], [0, focal, _SIZE / 2], [0, 0, 1.0]]
-    first = Cameras(
-        torch.eye(4, device="cpu")[None], torch.tensor([matrix], device="cpu"), _SIZE, _SIZE
-    )
-    ways = [np.array([math.sin(angle), 0.0, math.cos(angle)]) for angle in _ANGLES]
-    up = np.array([0.0, 1.0, 0.0])
-    return cameras_at_poses(
-        first, np.stack([look_at(middle + distance * w, middle, up) for w in ways])
-    )
+    distance = 3 * float(np.linalg.norm(highest - lowest))
+    camera = pinhole_camera(0.47 * 6 * _SIZE, _SIZE, _SIZE)
+    _, up, forward = np.eye(3)
+    return cameras_on_circle(camera, middle, up, forward, np.array(_ANGLES), distance, 0.0)
 
 
 def _agreement(vertices: Tensor, body: BodyTemplate, cameras: Cameras, shown: np.ndarray) -> float:
     """Return the intersection over union of mesh silhouettes with silhouettes ``shown`` (V, H,
     W)."""
     common = either = 0
-    for pose, intrinsics, mask in zip(
-        cameras.cam_from_world, cameras.intrinsics, shown, strict=True
-    ):
-        pixels = (vertices @ pose[:3, :3].T + pose[:3, 3]) @ intrinsics.T
-        flat = torch.nn.functional.pad(pixels[:, :2] / pixels[:, 2:] - 0.5, (0, 1), value=1.0)
+    for camera, mask in zip(cameras, shown, strict=True):
+        pixels = project_points(vertices, camera)[0] - 0.5
+        flat = torch.nn.functional.pad(pixels, (0, 1), value=1.0)
         seen = rasterize(flat[body.faces].double().numpy(), cameras.width, cameras.height)
         own = np.zeros(mask.size, bool)
         own[seen.index] = True
