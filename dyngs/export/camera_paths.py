@@ -72,6 +72,12 @@ def pick_cameras(cameras: Cameras, rows: Sequence[int] | np.ndarray) -> Cameras:
     )
 
 
+def spread_rows(length: int, count: int) -> np.ndarray:
+    """Return at most ``count`` indices below ``length``, evenly spaced, with the first and the
+    last."""
+    return np.unique(np.linspace(0, length - 1, count).round().astype(int))
+
+
 def resize_cameras(cameras: Cameras, width: int, height: int) -> Cameras:
     """Return the cameras at another image size, with square pixels and the whole image visible."""
     scale = min(width / cameras.width, height / cameras.height)

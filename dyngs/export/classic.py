@@ -12,7 +12,7 @@ from dyngs.core.camera import Cameras
 from dyngs.core.conventions import SH_C0, RasterizeMode
 from dyngs.core.errors import log_info
 from dyngs.core.gaussians import Gaussians
-from dyngs.export.camera_paths import pick_cameras
+from dyngs.export.camera_paths import pick_cameras, spread_rows
 from dyngs.export.images import compare_with_images
 from dyngs.gaussians.rendering import RenderOptions, contributions, render, splat_options
 from dyngs.io.formats.packing import logit
@@ -51,7 +51,7 @@ def fit_classic(
     """
     source = replace(splat_options(splat), near=near)
     target = replace(CLASSIC, near=near)
-    rows = np.unique(np.linspace(0, len(cameras) - 1, MOST_VIEWS).round().astype(int))
+    rows = spread_rows(len(cameras), MOST_VIEWS)
     is_checked = np.arange(len(rows)) % CHECKED == CHECKED // 2
     checked = pick_cameras(cameras, rows[is_checked] if is_checked.any() else rows)
     fitted = pick_cameras(cameras, rows[~is_checked])

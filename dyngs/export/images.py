@@ -18,7 +18,7 @@ from dyngs.core.conventions import ProgressCallback, encode_srgb, ignore_progres
 from dyngs.core.errors import DyngsError
 from dyngs.core.metrics import psnr
 from dyngs.data.loader import ImageLoader
-from dyngs.export.camera_paths import CameraPath, pick_cameras
+from dyngs.export.camera_paths import CameraPath, pick_cameras, spread_rows
 from dyngs.export.orbits import frame_orbit_for_points
 from dyngs.export.video import video_writer
 from dyngs.gaussians.rendering import file_render_options, render, splat_options
@@ -153,7 +153,7 @@ def write_split_images(
     loader = ImageLoader(views, opened.config.data)
     scene = opened.for_split(split).renderable.to(device)
     options = _with_depth(scene, output)
-    shown = np.linspace(0, len(loader) - 1, min(len(loader), 12)).round().astype(int)
+    shown = spread_rows(len(loader), 12)
     rows: list[tuple[str, np.ndarray, np.ndarray]] = []
 
     def frames() -> Iterator[tuple[str, DrawnImage]]:
@@ -337,8 +337,7 @@ def compare_file_with_run(
     if cameras is None:
         cameras = frame.inverse().cameras(_orbit_of_file(meant))
     else:
-        rows = np.unique(np.linspace(0, len(cameras) - 1, 4).round().astype(int))
-        cameras = pick_cameras(cameras, rows)
+        cameras = pick_cameras(cameras, spread_rows(len(cameras), 4))
     black = torch.zeros(3, device=scene.device)
     with torch.no_grad():
         wanted = scene.render(cameras, time, background=black).rgb

@@ -21,7 +21,7 @@ from dyngs.data.geometry import (
     up_direction,
     world_from_cam,
 )
-from dyngs.export.camera_paths import CameraPath
+from dyngs.export.camera_paths import CameraPath, spread_rows
 
 
 def orbit_path(
@@ -201,7 +201,7 @@ def path_along(
     """
     poses = world_from_cam(cameras)
     # The path is smoothed, so 500 cameras suffice.
-    kept = np.linspace(0, len(poses) - 1, min(len(poses), 500)).round().astype(int)
+    kept = spread_rows(len(poses), 500)
     poses = poses[kept]
     if times is not None and len(kept) > 1:
         seconds = np.asarray(times, np.float64)[kept]

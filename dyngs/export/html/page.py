@@ -17,6 +17,7 @@ from dyngs.core.camera import Cameras
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import format_count
 from dyngs.data.geometry import estimate_focus
+from dyngs.export.camera_paths import spread_rows
 from dyngs.export.choose_path import (
     framing_points,
     frontal_cameras,
@@ -181,7 +182,7 @@ def _initial_views(
         capture = opened.capture
         distinct = {view.cam_from_world.tobytes(): view for view in capture.splits["train"][::-1]}
         others = list(distinct.values())[::-1]
-        rows = np.linspace(0, len(others) - 1, min(len(others), MOST_VIEWS)).round().astype(int)
+        rows = spread_rows(len(others), MOST_VIEWS)
         chosen = (first or select_view(capture), *(others[i] for i in rows))
         return training_cameras(chosen, opened.config.data), estimate_focus(cameras).tolist()
     target = np.median(framing_points(opened.renderable).cpu().numpy(), axis=0)
