@@ -7,6 +7,7 @@ evaluate them. Symbols: F time steps, V images of each, J joints.
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from statistics import fmean
@@ -123,8 +124,8 @@ def fit_poses_to_images(
     Returns:
         The scene with the fitted poses, and the number of updates at each of the F time steps.
     """
-    groups = group_by_time(images, indices)
-    times = sorted(groups)
+    groups = group_by_time(images, range(len(images.times)) if indices is None else indices)
+    times = list(groups)
     starts = replace(
         MotionClip.joined([scene.played_clip.at(time) for time in times]),
         times=torch.tensor(times, dtype=torch.float64, device="cpu"),
@@ -149,18 +150,12 @@ def fit_poses_to_images(
     return scene.with_corrected_motion(clip), counts
 
 
-def group_by_time(
-    images: ImageLoader, indices: Collection[int] | None = None
-) -> dict[float, list[int]]:
-    """Return the indices of images by time; images without a time belong to time 0.
-
-    ``indices`` selects images; None: all.
-    """
-    groups: dict[float, list[int]] = {}
-    for index, time in enumerate(images.times):
-        if indices is None or index in indices:
-            groups.setdefault(0.0 if time is None else time, []).append(index)
-    return groups
+def group_by_time(images: ImageLoader, indices: Collection[int]) -> dict[float, list[int]]:
+    """Return ``indices`` of images by ascending time; images without a time belong to time 0."""
+    groups: dict[float, list[int]] = defaultdict(list)
+    for index in indices:
+        groups[images.times[index] or 0.0].append(index)
+    return dict(sorted(groups.items()))
 
 
 def _fit_pose(
@@ -272,7 +267,7 @@ class PoseRefit:
 
     def __init__(self, images: ImageLoader, background: Tensor, steps: int) -> None:
         self._images, self._background = images, background
-        self._groups = [sorted(group) for _, group in sorted(group_by_time(images).items())]
+        self._groups = list(group_by_time(images, range(len(images.times))).values())
         self._starts = [round(start * steps) for start in REFIT_STARTS]
         # as many updates as the run has, at most
         windows = steps // (len(FIRST_RATES) * UPDATES_PER_WINDOW * len(self._groups))
@@ -282,9 +277,7 @@ class PoseRefit:
 
     def applies_to(self, scene: HumanScene) -> bool:
         """True if each row of the training clip has its own images, and one has two or more."""
-        return len(self._groups) == len(scene.clip) and any(
-            map(self._is_fitted, range(len(scene.clip)))
-        )
+        return len(self._groups) == len(scene.clip) and max(map(len, self._groups)) > 1
 
     def edit_scene(self, scene: HumanScene, step: int) -> tuple[HumanScene, str] | None:
         """Refit one time step after ``step``; return the scene and a message, or None if nothing
@@ -293,12 +286,8 @@ class PoseRefit:
         The first step of a refit runs the trial, whose decision the message reports.
         """
         elapsed = [step - start for start in self._starts if start <= step]
-        if (
-            not self.is_active
-            or not elapsed
-            or elapsed[-1] > len(self._groups)
-            or not self.applies_to(scene)
-        ):
+        is_due = self.is_active and elapsed and elapsed[-1] <= len(self._groups)
+        if not is_due or not self.applies_to(scene):
             return None
         scene.clear_caches()
         if elapsed[-1] > 0:
@@ -318,14 +307,12 @@ class PoseRefit:
         At up to ``NUM_TRIAL_TIMES`` time steps, poses are fitted to all views but one. PSNR is
         measured in the person's box of that view.
         """
-        rows = [row for row in range(len(self._groups)) if self._is_fitted(row)]
-        rows = [
-            rows[(2 * i + 1) * len(rows) // (2 * NUM_TRIAL_TIMES)] for i in range(NUM_TRIAL_TIMES)
-        ]
+        groups = [group for group in self._groups if len(group) > 1]
+        rows = [(2 * i + 1) * len(groups) // (2 * NUM_TRIAL_TIMES) for i in range(NUM_TRIAL_TIMES)]
         gains = []
         moves = []
         for number, row in enumerate(dict.fromkeys(rows)):
-            group = self._groups[row]
+            group = groups[row]
             held_out = group[number % len(group)]
             fitted = self._fitted(scene, [i for i in group if i != held_out])
             gains.append(self._psnr(fitted, held_out) - self._psnr(scene, held_out))
@@ -337,7 +324,7 @@ class PoseRefit:
     def refit_frame(self, scene: HumanScene, row: int) -> HumanScene:
         """Return the scene with row ``row`` of the training clip refitted and its corrections
         reset to 0."""
-        if not self._is_fitted(row):
+        if len(self._groups[row]) == 1:
             return scene
         fitted_clip = self._fitted(scene, self._groups[row]).replacement_clip
         clip = {"poses": scene.clip.poses.clone(), "trans": scene.clip.trans.clone()}
@@ -346,9 +333,6 @@ class PoseRefit:
                 x[row] = getattr(fitted_clip, name)[0]
                 scene.learned[name][row] = 0
         return replace(scene, clip=replace(scene.clip, **clip))
-
-    def _is_fitted(self, row: int) -> bool:
-        return len(self._groups[row]) > 1
 
     def _fitted(self, scene: HumanScene, indices: list[int]) -> HumanScene:
         frozen = replace(scene, gaussians=scene.gaussians.detach())
@@ -363,8 +347,7 @@ class PoseRefit:
             image.cameras, image.time, options=scene.options, background=self._background
         ).rgb[0]
         box = None if image.alpha is None else silhouette_box(image.alpha)
-        if box is None:
-            box = slice(None), slice(None)
+        box = box or (slice(None), slice(None))
         mask = None if image.mask is None else image.mask[box]
         return psnr(render[box], image.composite(self._background)[box], mask)
 

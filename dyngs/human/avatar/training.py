@@ -12,7 +12,6 @@ from torch import Tensor
 
 from dyngs.capture.masks import SEEN_BARE
 from dyngs.core.camera import Cameras
-from dyngs.core.errors import DyngsError
 from dyngs.core.state import Role, State, with_role
 from dyngs.data.capture import View
 from dyngs.data.loader import Image, ImageLoader
@@ -289,13 +288,8 @@ class HumanTraining(SceneTraining[HumanScene]):
         self._refit = refit
 
     def time_step(self, scene: HumanScene, image: Image, step: int) -> GaussianTimeStep:
-        """Return the Gaussians in the pose of ``image``, and the regularisation terms.
-
-        Raises DyngsError: the frame of the image has no body parameters.
-        """
-        if image.frame not in self._rows:
-            raise DyngsError(f"view {image.name!r}: no body parameters for frame {image.frame}")
-        row = self._row(scene, image.frame)
+        """Return the Gaussians in the pose of ``image``, and the regularisation terms."""
+        row = self._row(scene, image.frame or 0)
         gaussians = scene.gaussians
         anchors = scene.anchors
         offsets = (gaussians.means - anchors.points) / CENTIMETRE
