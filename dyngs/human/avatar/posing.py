@@ -7,7 +7,7 @@ template, F frames.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from statistics import median_high
 
@@ -29,7 +29,6 @@ from dyngs.ops.harmonics import lit
 from dyngs.ops.posing import pose_by_joints
 from dyngs.ops.quaternions import quats_from_matrices, rotation_matrices
 
-LIGHT_NOT_EXPORTED = "the learned light is not exported; colours are those under uniform light"
 NUM_LIGHT_TERMS = 8  # spherical harmonics of degree 1 and 2; degree 0 is the colour itself
 
 
@@ -326,8 +325,8 @@ def surface_gaussians(
     gaussians, anchors = zip(
         *(texel_gaussians(texels, (0.0,), sh_degree) for texels in texel_sets), strict=True
     )
-    columns = {name: [one.tensors()[name] for one in anchors] for name in anchors[0].tensors()}
-    joined = Anchors(**{name: torch.cat(x) for name, x in columns.items()})
+    rows = zip(*(one.tensors().values() for one in anchors), strict=True)
+    joined = Anchors(*(torch.cat(parts) for parts in rows))
     return Gaussians.joined(gaussians), joined, torch.cat([texels.normals for texels in texel_sets])
 
 
@@ -445,6 +444,6 @@ def symmetrize_joint_gradients(learned: Parameters) -> None:
         gradient.add_(other).div_(2)
 
 
-def learned_light(learned: Parameters) -> Light | None:
+def learned_light(learned: Parameters | Mapping[str, Tensor]) -> Light | None:
     """Return the learned light, or None."""
     return Light(learned["normals"], learned["light"]) if "light" in learned else None

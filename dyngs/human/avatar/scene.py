@@ -22,7 +22,6 @@ from dyngs.gaussians.colour.network import RestPose
 from dyngs.gaussians.optimizer import Parameters
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep
 from dyngs.human.avatar.posing import (
-    LIGHT_NOT_EXPORTED,
     PER_FRAME,
     Anchors,
     BodyPose,
@@ -65,10 +64,8 @@ class HumanScene(GaussianScene, Posable):
     def from_state(gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> HumanScene:
         """Restore the scene from the tensors of ``state``; it plays the training clip. Raises
         KeyError or ValueError."""
-        tensors = dict(tensors)
-        tensors.setdefault(
-            "learned.weights", torch.zeros_like(tensors["anchors.weights"])
-        )  # exported files hold the corrected weights only
+        # Exported files hold the corrected weights only.
+        tensors = {"learned.weights": torch.zeros_like(tensors["anchors.weights"]), **tensors}
         require_avatar(gaussians, tensors)
         anchors = Anchors(**select_prefix(tensors, "anchors"))
         clip = MotionClip(**select_prefix(tensors, "clip"))
@@ -127,8 +124,7 @@ class HumanScene(GaussianScene, Posable):
     @property
     def light(self) -> Light | None:
         """Learned light, or None."""
-        light = learned_light(self.learned)
-        return None if light is None else Light(light.normals.detach(), light.factors.detach())
+        return learned_light(self.learned.values())
 
     @property
     def fit(self) -> SharedCorrection:
@@ -140,7 +136,9 @@ class HumanScene(GaussianScene, Posable):
     @property
     def left_out(self) -> tuple[str, ...]:
         """Warnings about what exported files cannot hold."""
-        return () if self.light is None else (LIGHT_NOT_EXPORTED,)
+        if self.light is None:
+            return ()
+        return ("the learned light is not exported; colours are those under uniform light",)
 
     @property
     def played_clip(self) -> MotionClip:
@@ -245,10 +243,10 @@ class HumanScene(GaussianScene, Posable):
         def transform(clip: MotionClip) -> MotionClip:
             return transform_clip(clip, rotation, scale, shift, pelvis)
 
-        replacement_clip = (
-            None if self.replacement_clip is None else transform(self.replacement_clip)
-        )
-        return replace(self, clip=transform(self.clip), replacement_clip=replacement_clip)
+        moved = replace(self, clip=transform(self.clip))
+        if self.replacement_clip is None:
+            return moved
+        return moved.with_motion(transform(self.replacement_clip))
 
     def for_split(self, capture: Capture, split: Split) -> HumanScene:
         """Return the person in the motion of a split's views.
