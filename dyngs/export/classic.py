@@ -94,8 +94,8 @@ def _fit(
     weights = []
     footprints = own.means.new_zeros(len(own))
     colours = own.means.new_zeros(len(own), 3)
-    for i in range(len(cameras)):
-        camera = cameras.select(i)
+    total = torch.zeros_like(footprints)
+    for camera in cameras:
         weight = contributions(own, camera, source)[0]
         projection = _project(own, camera, source)
         rgb = evaluate_harmonics(
@@ -104,8 +104,8 @@ def _fit(
         # area of a pixel at the depth of the Gaussian
         footprints += weight * (projection.depths[0] / camera.intrinsics[0, 0, 0]).square()
         colours += weight[:, None] * rgb
+        total += weight
         weights.append(weight)
-    total = torch.stack(weights).sum(0)
     seen = total > 0
     total = total.clamp_min(torch.finfo(total.dtype).tiny)
     variances = own.scales.square()
@@ -113,9 +113,9 @@ def _fit(
     variances = torch.maximum(variances - excess[:, None], SMALLEST * variances)
     shape = own.replace(log_scales=variances.log() / 2)
     ratios = own.means.new_zeros(len(own))
-    for i, weight in enumerate(weights):
-        before = _project(own, cameras.select(i), source)
-        after = _project(shape, cameras.select(i), target)
+    for camera, weight in zip(cameras, weights, strict=True):
+        before = _project(own, camera, source)
+        after = _project(shape, camera, target)
         # Areas after the low-pass are inverse to these products. A view without the Gaussian has no
         # area, and weight 0.
         sharpness = [(x.factors[0, :, 0] * x.factors[0, :, 2]).abs() for x in (before, after)]
@@ -133,7 +133,7 @@ def _optimize(
     start: Gaussians, own: Gaussians, cameras: Cameras, source: RenderOptions, target: RenderOptions
 ) -> Gaussians:
     """Return ``start`` after Adam steps on the difference between both renderings."""
-    views = [cameras.select(i) for i in range(len(cameras))]
+    views = list(cameras)
     parameters = {name: getattr(start, name).clone().requires_grad_() for name in RATES}
     groups = [{"params": [parameters[name]], "lr": rate} for name, rate in RATES.items()]
     optimizer = torch.optim.Adam(groups, eps=1e-15)

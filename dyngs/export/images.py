@@ -86,14 +86,14 @@ def render_path(
 
     The scene is deformed again only if the time changes. A path without times uses time 0.
     """
+    times = [None] * len(path) if path.times is None or scene.is_static else path.times
     time_step, step_time = None, None
-    for i in range(len(path)):
-        time = None if path.times is None or scene.is_static else path.times[i]
+    for camera, time in zip(path.cameras, times, strict=True):
         if time_step is None or time != step_time:
             with torch.no_grad():
                 time_step = scene.drawing_step(time)
             step_time = time
-        yield render_frame(scene, path.cameras.select(i), time_step, options)
+        yield render_frame(scene, camera, time_step, options)
 
 
 def write_path_images(

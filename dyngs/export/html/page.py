@@ -188,7 +188,7 @@ def _initial_views(
     target = np.median(framing_points(opened.renderable).cpu().numpy(), axis=0)
     if not views:
         ring = orbit_cameras_around(opened, _RING)
-        views = [ring.select(i) for i in range(_RING)]
+        views = list(ring)
         if opened.person is not None:
             views = [frontal_cameras(opened).select(1), *views]
             target = estimate_focus(ring)

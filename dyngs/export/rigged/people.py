@@ -231,12 +231,11 @@ def add_weights(document: GlbDocument, weights: Tensor) -> dict[str, int]:
     joints, fractions = (torch.nn.functional.pad(x, (0, missing)) for x in (joints, fractions))
     joints = torch.where(fractions > 0, joints, 0).to(torch.uint8)
     found: dict[str, int] = {}
-    for k in range(0, fractions.shape[1], 4):
-        own = fractions[:, k : k + 4]
-        if k and not bool(own.any()):
+    for k, (own, shares) in enumerate(zip(joints.split(4, 1), fractions.split(4, 1), strict=True)):
+        if k and not bool(shares.any()):
             break
-        found[f"JOINTS_{k // 4}"] = document.add_numbers(joints[:, k : k + 4].numpy(), VERTICES)
-        found[f"WEIGHTS_{k // 4}"] = document.add_numbers(own.float().numpy(), VERTICES)
+        found[f"JOINTS_{k}"] = document.add_numbers(own.numpy(), VERTICES)
+        found[f"WEIGHTS_{k}"] = document.add_numbers(shares.float().numpy(), VERTICES)
     return found
 
 
