@@ -47,7 +47,7 @@ class CameraPath:
 
 def clamp_times(times: Sequence[float]) -> tuple[tuple[float, ...], tuple[str, ...]]:
     """Return ``times`` clamped to [0, 1], and a note if any changed."""
-    inside = tuple(min(max(float(time), 0.0), 1.0) for time in times)
+    inside = tuple(np.clip(times, 0.0, 1.0).tolist())
     count = sum(a != b for a, b in zip(times, inside, strict=True))
     note = f"clamped {count} of {len(times)} times to [0, 1]"
     return inside, (note,) if count else ()

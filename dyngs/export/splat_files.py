@@ -329,11 +329,7 @@ def write_run_sequence(
 
 
 def write_run_levels(
-    opened: OpenedScene,
-    folder: Path,
-    time: float = 0.0,
-    part: Part = "all",
-    how: WriteOptions = DEFAULT_WRITE_OPTIONS,
+    opened: OpenedScene, folder: Path, time: float, part: Part, how: WriteOptions
 ) -> tuple[tuple[int, ...], tuple[str, ...]]:
     """Write a run at a time as a new folder of .sog levels. Return the Gaussians per level, and
     notes.
@@ -534,7 +530,7 @@ def _fourdgs(path: Path) -> tuple[Any, Any, Any]:
 
 @torch.no_grad()
 def write_rigid_bodies(
-    opened: OpenedScene, path: Path, time: float, how: WriteOptions = DEFAULT_WRITE_OPTIONS
+    opened: OpenedScene, path: Path, time: float, how: WriteOptions
 ) -> WrittenFile:
     """Write a run at a time in [0, 1] as .glb: an animated node per rigid body, and one for the
     rest.

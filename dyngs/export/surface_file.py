@@ -13,7 +13,7 @@ from dyngs.baselines.fields.kind import NgpModel
 from dyngs.baselines.fields.scene import space_of
 from dyngs.core.errors import DyngsError
 from dyngs.data.times import evenly_spaced
-from dyngs.export.splat_files import DEFAULT_WRITE_OPTIONS, WriteOptions, choose_write_options
+from dyngs.export.splat_files import WriteOptions, choose_write_options
 from dyngs.gaussians.surface import extract_surface, opaque_box
 from dyngs.io.formats.ply import encode_ply
 from dyngs.io.formats.similarity import Similarity, origin_offset
@@ -41,16 +41,15 @@ def write_surface(
     opened: OpenedScene,
     out: Path,
     *,
-    time: float = 0.0,
-    options: SurfaceOptions | None = None,
-    how: WriteOptions = DEFAULT_WRITE_OPTIONS,
+    time: float,
+    options: SurfaceOptions,
+    how: WriteOptions,
 ) -> Surface:
     """Write the surface of a scene at ``time`` and return it, in the coordinates of the capture.
 
     Raises:
         DyngsError: unsupported suffix or option, a missing capture, or an empty surface.
     """
-    options = options or SurfaceOptions()
     suffix = out.suffix.lower()
     scene = opened.renderable
     for name, value in vars(options).items():
