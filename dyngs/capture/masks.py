@@ -219,15 +219,15 @@ def _alpha(
     nearest = ndimage.distance_transform_edt(
         weights < 1e-3, return_distances=False, return_indices=True
     )
-    colours = (sums / weights.clip(1e-6)[..., None])[tuple(nearest)]
+    colours = (sums / weights.clip(1e-6)[..., None])[tuple(np.asarray(nearest))]
     contrast = np.square(colours - background.colours).sum(-1)
     difference = np.square(image - background.colours).sum(-1)
     ratio = np.sqrt(difference / contrast.clip(1.0))
     ratio = (0.5 + MATTE.slope * (ratio - 0.5)).clip(0, 1)
     ratio[shadow] = 0
     confidence = contrast / (contrast + MATTE.noise**2)
-    near = (ndimage.distance_transform_edt(mask) <= MATTE.inside * height) & (
-        ndimage.distance_transform_edt(~mask) <= max(outside * height, 2)
+    near = (_distance(mask) <= MATTE.inside * height) & (
+        _distance(~mask) <= max(outside * height, 2)
     )
     return np.where(near & usable, confidence * ratio + (1 - confidence) * soft, soft)
 
@@ -240,7 +240,12 @@ def _height(mask: np.ndarray) -> int:
 def _inner(mask: np.ndarray, distance: float) -> np.ndarray:
     """Return the pixels (H, W) of a mask that are further than ``distance``, in heights of the
     person, from its outline."""
-    return ndimage.distance_transform_edt(mask) > max(distance * _height(mask), 2)
+    return _distance(mask) > max(distance * _height(mask), 2)
+
+
+def _distance(mask: np.ndarray) -> np.ndarray:
+    """Return the distance (H, W), px, of pixels in a mask from those outside."""
+    return np.asarray(ndimage.distance_transform_edt(mask))
 
 
 def camera_moves(images: np.ndarray) -> bool:

@@ -560,6 +560,9 @@ def write_detected_person(
     try:
         capture = read_fixed_camera(options) if clip else read_capture(options)
         inputs = detect_person(capture, detector, folder, on_progress, log, person=options.person)
+        if capture.has_alpha:
+            log("using the silhouettes of the images; only key points are detected")
+            inputs = replace(inputs, masks=None)
         result = write_fitted_capture(options, out, on_progress, inputs)
         for picture in folder.glob("*.png"):
             shutil.copy(picture, out / picture.name)

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from dyngs.config import DataConfig
@@ -26,7 +26,6 @@ from dyngs.data.capture import Capture, Split, View
 from dyngs.data.images.images import area_downscale
 from dyngs.data.images.maps import silhouette_box
 from dyngs.data.loader import Image, ImageLoader
-from dyngs.data.times import evenly_spaced
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.optimizer import Parameters
 from dyngs.gaussians.rendering import RenderOptions, render
@@ -49,14 +48,11 @@ from dyngs.human.fit.skeleton_fit import (
     SkeletonModel,
     SkeletonTargets,
     fit_skeleton,
-    limb_direction_error,
 )
-from dyngs.human.fit.viterbi import viterbi_path
 from dyngs.human.motion.motion import (
     CapturedMotion,
     MotionClip,
     captured_motion,
-    compose_rotations,
 )
 
 _OPTIONS = RenderOptions(nonfinite="trust", eps2d=0.1, mode=RasterizeMode.ANTIALIASED)
@@ -153,6 +149,11 @@ class ObservedFrame:
     positions: Tensor | None = None  # (55, 4) world positions and confidence of 3D joints
     # (55, 4) joints relative to the hips, m, in world axes, and confidence; only directions count
     relative: Tensor | None = None
+
+    @property
+    def has_joints(self) -> bool:
+        """Whether there are key points or joints besides the silhouettes."""
+        return not (self.joints is None and self.positions is None and self.relative is None)
 
     def select_views(self, turn: int, count: int) -> ObservedFrame:
         """Return ``count`` evenly spaced views; V consecutive turns use each view equally often."""
@@ -334,7 +335,7 @@ _RATES = {
 """Initial learning rates; they fall to a tenth."""
 LIMIT_WEIGHT = 2e-2
 """Weight of the mean squared excess over joint limits, in standard deviations."""
-KEYPOINT_STD = 0.02  # expected error of a key point, as a fraction of the crop's side
+JOINT_WEIGHT = 0.1  # of errors of key points and joints, relative to the silhouette error
 OUTLIER_ERROR = 1.0
 """Relative squared silhouette error at which a mask counts as an outlier; good masks have 0.05 to
 0.2."""
@@ -352,41 +353,37 @@ def silhouette_error(rendered: Tensor, observed: ObservedFrame) -> Tensor:
     return (error / (1 + error / OUTLIER_ERROR)).mean()
 
 
-def keypoint_error(joints: Tensor, keypoints: Tensor, cameras: Cameras) -> Tensor:
-    """Return the robust reprojection error of joints (J, 3) to key points (V, 55, 3) of
-    ``ObservedFrame``.
-
-    J is 24, 52 or 55; joints of the same name are compared.
-    """
-    rows = SMPLX_ROWS[len(joints)]
-    keypoints = keypoints[:, list(rows)]
-    local = (
-        joints[: len(rows)] @ cameras.cam_from_world[:, :3, :3].mT
-        + cameras.cam_from_world[:, None, :3, 3]
+def skeleton_targets(
+    frames: Mapping[int, ObservedFrame], num_frames: int, joints: int
+) -> SkeletonTargets:
+    """Return the key points and joints of observed frames, by row, for a body with ``joints``
+    joints."""
+    rows = list(SMPLX_ROWS[joints])
+    indices: list[int] = []
+    projections = []
+    keypoints = []
+    positions = torch.zeros(num_frames, len(rows), 4, device="cpu")
+    relative = torch.zeros(num_frames, len(rows), 4, device="cpu")
+    for row, frame in frames.items():
+        intrinsics = frame.cameras.intrinsics.clone()
+        intrinsics[:, :2] /= frame.cameras.width
+        projections.append(intrinsics @ frame.cameras.cam_from_world[:, :3])
+        seen = frame.joints
+        if seen is None:
+            seen = torch.zeros(len(intrinsics), len(JOINT_NAMES), 3, device="cpu")
+        keypoints.append(seen[:, rows])
+        indices += [row] * len(seen)
+        if frame.positions is not None:
+            positions[row] = frame.positions[rows]
+        if frame.relative is not None:
+            relative[row] = frame.relative[rows]
+    return SkeletonTargets(
+        torch.tensor(indices, device="cpu"),
+        torch.cat(projections),
+        torch.cat(keypoints),
+        positions,
+        relative,
     )
-    pixels = local @ cameras.intrinsics.mT
-    positions = pixels[..., :2] / pixels[..., 2:].clamp_min(1e-3) / cameras.width
-    return _robust_mean(
-        (positions - keypoints[..., :2]).square().sum(-1) / KEYPOINT_STD**2, keypoints[..., 2]
-    )
-
-
-def joint_position_error(joints: Tensor, targets: Tensor, unit: Tensor) -> Tensor:
-    """Return the robust distance of joints (J, 3) to 3D joints (55, 4), with an expected error of
-    3 cm.
-
-    ``unit`` is the length of a metre of the person in world units.
-    """
-    rows = SMPLX_ROWS[len(joints)]
-    targets = targets[list(rows)]
-    squared = (joints[: len(rows)] - targets[:, :3]).square().sum(-1) / (0.03 * unit) ** 2
-    return _robust_mean(squared, targets[:, 3])
-
-
-def _robust_mean(squares: Tensor, weights: Tensor) -> Tensor:
-    """Return the weighted mean of sqrt(1 + s) - 1 of squared errors s; large errors count
-    linearly."""
-    return (weights * ((1 + squares).sqrt() - 1)).sum() / weights.sum().clamp_min(1.0)
 
 
 @dataclass(frozen=True)
@@ -462,20 +459,11 @@ class BodyFit:
         for row, frame in frames.items():
             pose = self.pose(learned, row)
             error = silhouette_error(render_silhouettes(body.in_pose(pose), frame.cameras), frame)
-            if frame.joints is not None:
+            if frame.has_joints:
                 joints = posed_joints(body.skeleton, pose)
-                error = error + 0.1 * keypoint_error(joints, frame.joints, frame.cameras)
-            if frame.positions is not None:
-                joints = posed_joints(body.skeleton, pose)
-                error = error + 0.1 * joint_position_error(
-                    joints, frame.positions, pose.scale.detach()
-                )
-            if frame.relative is not None:
-                joints = posed_joints(body.skeleton, pose)
-                rows = list(SMPLX_ROWS[len(joints)])
-                error = error + 0.1 * limb_direction_error(
-                    joints[: len(rows)], frame.relative[rows]
-                )
+                targets = skeleton_targets({0: frame}, 1, len(joints))
+                joint_errors = targets.error(joints[None], float(pose.scale))
+                error = error + JOINT_WEIGHT * joint_errors.squeeze()
             errors.append(error)
         return torch.stack(errors).mean()
 
@@ -577,71 +565,7 @@ def apply_fit(learned: Parameters, clip: MotionClip, *, own_frames: bool) -> Mot
     return replace(clip_with_rotations, trans=clip_with_rotations.trans + translation)
 
 
-NUM_HEADINGS = 8  # directions that a person may face
-STEPS = 40
-"""Adam steps per heading of an anchor frame, and per frame and resolution level when tracking."""
-MAX_HEADING_ERROR = math.radians(30)
-"""Deviation of the root from the heading path above which tracking restarts on the path."""
 STATURE = 1.70  # assumed height of the person, m, for a single camera
-FramePose = tuple[Tensor, Tensor, float]
-"""Pose (J, 3), translation (3,) and error of one frame."""
-
-
-def likely_headings(errors: Sequence[Sequence[float]], weight: float = 0.01) -> list[int]:
-    """Return the most likely heading (A,) of each anchor frame from errors (A, H) per heading.
-
-    ``weight`` is the cost of a turn by 45 degrees between anchors; it grows with the squared
-    angle.
-    """
-    costs = np.asarray(errors, dtype=np.float64)
-    anchors, count = costs.shape
-    apart = np.abs(np.arange(count)[:, None] - np.arange(count))
-    change = weight * (np.minimum(apart, count - apart) * (8 / count)) ** 2
-    return viterbi_path(costs, np.broadcast_to(change, (anchors - 1, count, count)))
-
-
-def estimate_initial_poses(
-    times: Tensor,
-    body: BodyDiscs,
-    observed: Observations,
-    on_progress: ProgressCallback = ignore_progress,
-) -> MotionClip:
-    """Estimate the poses of F frames from silhouettes alone.
-
-    Up to 20 anchor frames are fitted from every heading; the most likely sequence of headings
-    gives the direction that the person faces. Each frame then starts from the pose of the previous
-    one, or from the heading path where tracking left it. Tracks without the path compete with it,
-    since silhouettes from opposite sides look alike. Raises DyngsError: the first frame has empty
-    masks.
-    """
-    first_frame = observed(0)
-    if first_frame is None:
-        raise DyngsError("the first frame has an empty mask; skip it (data.frames=1::)")
-    up = mean_up_direction(first_frame)
-    standing = standing_clip(times, body, up, observed)
-    anchors: list[int] = []
-    anchor_poses: list[list[FramePose]] = []
-    rows = evenly_spaced(len(times), 20)
-    for number, row in enumerate(rows, 1):
-        frame = observed(row)
-        if frame is not None:
-            anchors.append(row)
-            anchor_poses.append(_try_headings(standing, row, up, body, frame))
-        on_progress("body fit, headings", number, len(rows))
-    heading_path = likely_headings([[error for _, _, error in poses] for poses in anchor_poses])
-    roots = torch.stack(
-        [poses[heading][0][0] for poses, heading in zip(anchor_poses, heading_path, strict=True)]
-    )
-    roots = _interpolate_roots(anchors, roots, len(times))
-    starts: list[tuple[int, Tensor | None]] = [(heading_path[0], roots)]
-    # Silhouettes from opposite sides look alike: the path may be wrong.
-    best = sorted(range(NUM_HEADINGS), key=lambda i: anchor_poses[0][i][2])
-    starts += [(index, None) for index in best[:2]]
-    tracks = []
-    for number, (index, path_roots) in enumerate(starts, 1):
-        tracks.append(_track_poses(standing, anchor_poses[0][index], path_roots, body, observed))
-        on_progress("body fit, tracking poses", number, len(starts))
-    return min(tracks, key=lambda track: track[1])[0]
 
 
 def poses_from_key_points(
@@ -654,30 +578,7 @@ def poses_from_key_points(
     first = frames[min(frames)]
     up = mean_up_direction(first)
     standing = standing_clip(times, body, up, frames.get)
-    rows = list(SMPLX_ROWS[len(body.skeleton.joints)])
-    indices: list[int] = []
-    projections = []
-    keypoints = []
-    positions = torch.zeros(len(times), len(rows), 4, device="cpu")
-    relative = torch.zeros(len(times), len(rows), 4, device="cpu")
-    for row, frame in frames.items():
-        assert frame.joints is not None
-        intrinsics = frame.cameras.intrinsics.clone()
-        intrinsics[:, :2] /= frame.cameras.width
-        projections.append(intrinsics @ frame.cameras.cam_from_world[:, :3])
-        keypoints.append(frame.joints[:, rows])
-        indices += [row] * len(frame.joints)
-        if frame.positions is not None:
-            positions[row] = frame.positions[rows]
-        if frame.relative is not None:
-            relative[row] = frame.relative[rows]
-    targets = SkeletonTargets(
-        torch.tensor(indices, device="cpu"),
-        torch.cat(projections),
-        torch.cat(keypoints),
-        positions,
-        relative,
-    )
+    targets = skeleton_targets(frames, len(times), len(body.skeleton.joints))
     mean, std = usual_pose_statistics(NUM_FITTED_JOINTS)
     model = SkeletonModel(body.skeleton.joints, body.joint_dirs, body.skeleton.parents, mean, std)
     return fit_skeleton(standing, up, model, targets, on_progress)
@@ -740,110 +641,6 @@ def locate_person(frame: ObservedFrame, up: Tensor) -> tuple[Tensor, float | Non
     return middle + up * (0.53 - 0.5) * (height or STATURE), height
 
 
-def _try_headings(
-    standing: MotionClip, row: int, up: Tensor, body: BodyDiscs, frame: ObservedFrame
-) -> list[FramePose]:
-    """Fit one frame from every heading; return pose, translation and error of each.
-
-    Frames after the first are fitted at half the resolution.
-    """
-    angles = torch.arange(NUM_HEADINGS, device="cpu").double() * (2 * math.pi / NUM_HEADINGS)
-    starts = standing.poses[row].repeat(NUM_HEADINGS, 1, 1)
-    starts[:, 0] = compose_rotations(angles[:, None] * up, starts[:, 0])
-    levels = (2, 1) if row == 0 else (2,)
-    trans = standing.trans[row]
-    return [_fit_frame(standing, row, start, trans, body, frame, levels) for start in starts]
-
-
-def _fit_frame(
-    clip: MotionClip,
-    row: int,
-    pose: Tensor,
-    trans: Tensor,
-    body: BodyDiscs,
-    frame: ObservedFrame,
-    levels: Sequence[int] = (2, 1),
-) -> FramePose:
-    """Fit one frame from an initial pose; return pose (J, 3), translation and error (with
-    penalty).
-
-    ``levels`` are the factors by which the crops are downscaled, one after the other.
-    """
-    one = MotionClip(clip.times[row : row + 1], pose[None], trans[None], clip.scale[row : row + 1])
-    fitting = BodyFit(one, body, pose_prior(one, is_given=False))
-    learned = fitting.initial_parameters()
-    for level in levels:
-        next_views = rotate_views({0: frame.downscale(level)})
-        learned = fitting.optimize(learned, ("poses", "trans"), STEPS, next_views)
-    with torch.no_grad():
-        error = float(fitting.error(learned, {0: frame}) + fitting.penalty(learned))
-    fitted = pose.clone()
-    fitted[:NUM_FITTED_JOINTS] = compose_rotations(
-        pose[:NUM_FITTED_JOINTS], learned["poses"][0].detach()
-    )
-    return fitted, trans + learned["trans"][0].detach(), error
-
-
-def _interpolate_roots(anchors: Sequence[int], roots: Tensor, count: int) -> Tensor:
-    """Interpolate root rotations (A, 3) of the anchors to all frames (count, 3), axis-angle, rad.
-
-    Frames before the first and after the last anchor keep its rotation.
-    """
-    if len(anchors) == 1:
-        return roots.expand(count, 3)
-    between = Slerp(anchors, Rotation.from_rotvec(roots.numpy()))
-    rows = np.clip(np.arange(count), anchors[0], anchors[-1])
-    return torch.from_numpy(between(rows).as_rotvec()).to(roots)
-
-
-def _track_poses(
-    standing: MotionClip,
-    first: FramePose,
-    roots: Tensor | None,
-    body: BodyDiscs,
-    observed: Observations,
-) -> tuple[MotionClip, float]:
-    """Track poses from the first frame on; return the clip and the mean error.
-
-    ``roots`` (F, 3) is the heading path to stay near, or None.
-    """
-    poses = standing.poses.clone()
-    trans = standing.trans.clone()
-    poses[0], trans[0], _ = first
-    errors = []
-    for row in range(1, len(poses)):
-        frame = observed(row)
-        poses[row] = _extrapolate_pose(poses, row)
-        trans[row] = trans[row - 1] + standing.trans[row] - standing.trans[row - 1]
-        if frame is None:
-            continue
-        starts = [poses[row]]
-        if roots is not None and _angle_between(poses[row, 0], roots[row]) > MAX_HEADING_ERROR:
-            others = torch.stack([poses[row], standing.poses[row]])
-            others[:, 0] = roots[row]
-            starts = list(others)
-        candidates = [_fit_frame(standing, row, x, trans[row], body, frame) for x in starts]
-        poses[row], trans[row], error = min(candidates, key=lambda x: x[2])
-        errors.append(error)
-    return replace(standing, poses=poses, trans=trans), sum(errors) / max(len(errors), 1)
-
-
-def _extrapolate_pose(poses: Tensor, row: int) -> Tensor:
-    """Predict the pose (J, 3) of frame ``row`` by continuing 0.8 of the last rotation.
-
-    This keeps legs that pass each other apart. A restart on the heading path is not continued.
-    """
-    if row < 2 or _angle_between(poses[row - 2, 0], poses[row - 1, 0]) > MAX_HEADING_ERROR:
-        return poses[row - 1].clone()
-    previous, last = poses[row - 2 : row].double()
-    return compose_rotations(last, 0.8 * compose_rotations(-previous, last)).to(poses)
-
-
-def _angle_between(a: Tensor, b: Tensor) -> float:
-    """Return the angle, rad, between two rotations (3,) given as axis-angle vectors."""
-    return float(compose_rotations(-a.double(), b.double()).norm())
-
-
 RESOLUTION = 48  # texels per side of the discs
 MIN_GAIN, MIN_SHAPE_GAIN = 0.01, 0.03
 """Least IoU gain for which a more complex fit is chosen, and for which given poses are changed.
@@ -903,7 +700,7 @@ def fit_capture(
 
     With given poses: first the shape, then rotations shared by all frames, then rotations per
     frame; each stage is kept only if it improves held-out views clearly. Without poses: these are
-    estimated first (``estimate_initial_poses``).
+    estimated first from key points or joints (``poses_from_key_points``).
 
     Args:
         capture: with silhouettes.
@@ -918,8 +715,13 @@ def fit_capture(
         shape_known: keep the shape of ``body``.
 
     Raises:
-        DyngsError: no silhouettes, or empty masks.
+        DyngsError: no silhouettes, empty masks, or neither poses nor key points.
     """
+    if capture.body is None and not keypoints and not joints:
+        raise DyngsError(
+            f"{capture.root}: has neither body parameters nor key points of the person; run `dyngs "
+            "data people`, or give key points of another program (--keypoints, `dyngs docs people`)"
+        )
     if not capture.has_alpha:
         raise DyngsError(
             f"{capture.root}: the images have no silhouettes; add masks of the person ("
@@ -952,11 +754,7 @@ def fit_capture(
         first_gain = MIN_GAIN if shape_known else MIN_SHAPE_GAIN
     else:
         times = motion.clip.times
-        betas = None
-        if all(frame.joints is not None for frame in fit_views.used.values()):
-            clip, betas = poses_from_key_points(times, discs, fit_views.used, on_progress)
-        else:
-            clip = estimate_initial_poses(times, discs, fit_views.used.get, on_progress)
+        clip, betas = poses_from_key_points(times, discs, fit_views.used, on_progress)
         motion = CapturedMotion(clip, motion.frames)
         body_fit = BodyFit(clip, discs, pose_prior(clip, is_given=False))
         start = None if shape_known else betas

@@ -35,7 +35,7 @@ nose left_eye right_eye left_ear right_ear left_shoulder right_shoulder left_elb
 left_knee right_knee left_ankle right_ankle {26 * "- "} right_wrist {20 * "- "} left_wrist
 """
 # After the body: the feet, the face, and 21 points of each hand.
-_WHOLE_BODY = f"""
+_WHOLE_BODY: str = f"""
 {_COCO} left_toe - left_heel right_toe - right_heel {68 * "- "} {5 * "- "} left_index1 {11 * "- "} left_pinky1
 {3 * "- "} {5 * "- "} right_index1 {11 * "- "} right_pinky1 {3 * "- "}
 """
@@ -64,7 +64,7 @@ JOINTS = {
 """Rows in ``JOINT_NAMES`` of joints that detectors place at the joint; necks are not. Those of the
 feet follow from heels and toes."""
 BALL_OF_FOOT = 0.72  # position of the foot's joint between heel (0) and tip of the toes (1)
-KEY_POINTS = (
+KEY_POINTS: tuple[str, ...] = (
     *_COCO.split(),
     *("left_toe", "right_toe", "left_heel", "right_heel"),
     *("left_index1", "right_index1", "left_pinky1", "right_pinky1"),

@@ -145,10 +145,7 @@ def test_a_camera_in_which_nobody_is_found_is_left_out(clip: Path, tmp_path: Pat
     assert overlap(found.masks, 2) > 0.93
 
 
-def test_a_capture_of_the_person_comes_out(
-    clip: Path, tmp_path: Path, short_fits: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("dyngs.human.fit.capture_fit.STEPS", 2)
+def test_a_capture_of_the_person_comes_out(clip: Path, tmp_path: Path, short_fits: None) -> None:
     out = tmp_path / "ann"
     result = write_detected_person(
         DataConfig(root=clip, frames="0:10:4"), out, Rough(), log=[].append

@@ -19,9 +19,9 @@ from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture
 from dyngs.data.images.images import read_image
 from dyngs.data.read import read_capture
+from dyngs.human.avatar.posing import Skeleton, frame_pose, posed_joints
 from dyngs.human.body.body_reader import default_template, read_body, rest_shape
 from dyngs.human.body.skinning import axis_angle_to_matrix, joint_transforms
-from dyngs.human.fit import capture_fit
 from dyngs.human.fit.capture_fit import (
     MIN_GAIN,
     RESOLUTION,
@@ -158,15 +158,21 @@ def test_one_view_of_each_frame_is_left_out(wrong: tuple[Capture, Capture]) -> N
     assert few[0] == [0, 1, 2, 3]
 
 
-def test_without_given_poses_every_frame_has_its_own(
-    wrong: tuple[Capture, Capture], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(capture_fit, "STEPS", 1)
+def test_without_given_poses_every_frame_has_its_own(wrong: tuple[Capture, Capture]) -> None:
+    body = default_template()
+    assert wrong[1].body is not None
+    motion = captured_motion(
+        wrong[1].root, wrong[1].body["train"], wrong[1].splits["train"], body.joints
+    )
+    skeleton = Skeleton(body.joints, body.parents)
+    joints = {}
+    for row, frame in enumerate(motion.frames):
+        positions = posed_joints(skeleton, frame_pose(motion.clip, row)).float()
+        joints[frame] = torch.cat([positions, torch.ones_like(positions[:, :1])], dim=1)
     capture = wrong[1].replace(body=None)
     effort = FitEffort(side=32, steps=1, draws_per_frame=0)
-    fit = fit_capture(
-        capture, DataConfig(root=capture.root), default_template(), lambda *_: None, effort=effort
-    )
+    options = DataConfig(root=capture.root)
+    fit = fit_capture(capture, options, body, lambda *_: None, effort=effort, joints=joints)
     assert fit.candidates[0].name == "frame-by-frame poses"
     assert fit.motion.frames == (0, 1, 2, 3)
     poses = fit.clip.poses
@@ -174,6 +180,13 @@ def test_without_given_poses_every_frame_has_its_own(
     clips = collect_fitted_clips(capture, default_template(), fit, None)
     assert clips["train"].frames == (0, 1, 2, 3)
     assert torch.equal(clips["train"].clip.poses, poses)
+
+
+def test_silhouettes_alone_are_refused(wrong: tuple[Capture, Capture]) -> None:
+    """They do not show which way a person faces."""
+    capture = wrong[1].replace(body=None)
+    with pytest.raises(DyngsError, match=r"nor key points.*dyngs data people"):
+        fit_capture(capture, DataConfig(root=capture.root), default_template(), print)
 
 
 def test_masks_of_the_background_are_refused(

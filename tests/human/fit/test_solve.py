@@ -15,16 +15,16 @@ from dyngs.human.body.body_reader import default_template
 from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.fit import capture_fit
 from dyngs.human.fit.capture_fit import (
-    KEYPOINT_STD,
     LIMIT_WEIGHT,
     OUTLIER_ERROR,
     BodyDiscs,
     BodyFit,
     ObservedFrame,
     body_discs,
-    keypoint_error,
     pose_prior,
+    skeleton_targets,
 )
+from dyngs.human.fit.skeleton_fit import PARAMS
 from dyngs.human.motion.motion import MotionClip
 
 SIZE = 32
@@ -64,14 +64,18 @@ def test_key_points_in_place_cost_nothing_and_others_their_distance() -> None:
     positions = torch.zeros(1, 55, 3)
     joints[1] = torch.tensor([0.5, 1.0, 0.0])
     positions[0, :2] = torch.tensor([[0.5, 0.5, 1.0], [0.5 + 1.6 * 0.125, 0.5 - 1.6 * 0.25, 1.0]])
-    assert float(keypoint_error(joints, positions, camera())) == pytest.approx(0, abs=1e-6)
+
+    def error(keypoints: torch.Tensor) -> float:
+        alpha = torch.zeros(1, SIZE, SIZE)
+        frame = ObservedFrame(camera(), alpha, alpha, keypoints)
+        return float(skeleton_targets({0: frame}, 1, 55).error(joints[None], 1.0))
+
+    assert error(positions) == pytest.approx(0, abs=1e-6)
     moved = positions.clone()
-    moved[0, 0, 0] += 3 * KEYPOINT_STD
-    assert float(keypoint_error(joints, moved, camera())) == pytest.approx(
-        (math.sqrt(10) - 1) / 2, rel=1e-4
-    )
+    moved[0, 0, 0] += 3 * PARAMS.keypoint_std
+    assert error(moved) == pytest.approx((math.sqrt(10) - 1) / 2, rel=1e-4)
     moved[0, 0, 2] = 0
-    assert float(keypoint_error(joints, moved, camera())) == pytest.approx(0, abs=1e-6)
+    assert error(moved) == pytest.approx(0, abs=1e-6)
 
 
 def test_a_wrong_mask_among_right_ones_moves_the_person_less(

@@ -1,17 +1,13 @@
-"""First poses from silhouettes: place, size and heading of a person of whom nothing else is
-known."""
+"""Initial poses: position and size from silhouettes, headings from key points."""
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from dyngs.core.camera import Cameras
@@ -24,8 +20,6 @@ from dyngs.human.fit.capture_fit import (
     BodyFit,
     ObservedFrame,
     body_discs,
-    estimate_initial_poses,
-    likely_headings,
     locate_person,
     mean_up_direction,
     pose_prior,
@@ -34,25 +28,6 @@ from dyngs.human.fit.capture_fit import (
     usual_pose_statistics,
 )
 from dyngs.human.motion.motion import MotionClip
-
-
-def cost(errors: np.ndarray, path: tuple[int, ...], weight: float) -> float:
-    """Return the cost of a path by its definition."""
-    count = errors.shape[1]
-    total = sum(errors[i, x] for i, x in enumerate(path))
-    for a, b in itertools.pairwise(path):
-        apart = min(abs(a - b), count - abs(a - b)) * 8 / count
-        total += weight * apart**2
-    return float(total)
-
-
-@given(st.integers(0, 10**6), st.integers(1, 4), st.floats(0.0, 0.3))
-def test_no_path_costs_less(seed: int, anchors: int, weight: float) -> None:
-    errors = np.random.default_rng(seed).random((anchors, 5))
-    found = tuple(likely_headings(errors.tolist(), weight))
-    best = min(cost(errors, path, weight) for path in itertools.product(range(5), repeat=anchors))
-    assert cost(errors, found, weight) == pytest.approx(best)
-
 
 SIZE = 48
 
@@ -108,17 +83,6 @@ def test_place_and_size_of_who_stands_somewhere(body: BodyDiscs) -> None:
         torch.zeros(1, dtype=torch.float64), body, mean_up_direction(seen), lambda _: seen
     )
     assert float(clip.scale[0]) == pytest.approx(1.2, rel=0.1)
-
-
-def test_the_heading_is_found(body: BodyDiscs, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("dyngs.human.fit.capture_fit.STEPS", 15)
-    place = torch.tensor([0.0, 1.0, 0.0])
-    heading = 2.0
-    seen = seen_by(body, standing(place, heading), ring(3, place))
-    clip = estimate_initial_poses(torch.zeros(1, dtype=torch.float64), body, lambda _: seen)
-    facing = Rotation.from_rotvec(clip.poses[0, 0].double().numpy()).apply([0.0, 0.0, 1.0])
-    # few steps, from 45 degrees apart
-    assert facing @ np.array([math.sin(heading), 0.0, math.cos(heading)]) > 0.8
 
 
 def test_key_points_tell_which_way_a_turning_person_faces(body: BodyDiscs) -> None:
