@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dyngs.core.errors import DyngsError
 from dyngs.human.body.body import BodyTemplate
-from dyngs.human.body.mesh import grid_points, span
+from dyngs.human.body.mesh import rasterize
 
 # Twice the area over the squared longest edge below which a triangle is degenerate.
 _MIN_THICKNESS = 1e-9
@@ -83,11 +83,13 @@ def atlas_texels(body: BodyTemplate, resolution: int, vertices: Tensor | None = 
         )
     rest_vertices = rest_vertices.detach().double()
     corners = rest_vertices[body.faces]
-    corners_uv = torch.nn.functional.pad(body.uv.detach().double()[body.uv_faces], (0, 1))
+    corners_uv = torch.nn.functional.pad(
+        body.uv.detach().double()[body.uv_faces], (0, 1), value=1.0
+    )
     area = _areas(corners)
     area_uv = _areas(corners_uv)
     usable = (area > 0) & (area_uv > 0)
-    index, faces, barycentric = _rasterized(corners_uv, usable, resolution)
+    index, faces, barycentric = _covered_texels(corners_uv, usable, resolution)
     corner_indices = body.faces[faces]
     dtype = body.vertices.dtype
     normals_smooth = _interpolated(
@@ -106,47 +108,23 @@ def atlas_texels(body: BodyTemplate, resolution: int, vertices: Tensor | None = 
     )
 
 
-def _rasterized(
+def _covered_texels(
     corners_uv: Tensor, usable: Tensor, resolution: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Rasterise triangles of a UV map; return texels (P,), triangles (P,) and barycentrics (P, 3).
-
-    Exact along shared edges, because both triangles compute an edge's sign from the same end
-    points.
+    """Return the covered texels (P,), their triangles (P,) and barycentrics (P, 3).
 
     Args:
-        corners_uv: (T, 3, 2 or 3) corners.
+        corners_uv: (T, 3, 3) corners in the UV map, the third coordinate 1.
         usable: (T,) triangles that may cover texels.
         resolution: texels per side.
     """
-    corners = corners_uv.cpu().numpy()
     triangles = np.flatnonzero(usable.cpu().numpy())
-    x = corners[triangles, :, 0] * resolution - 0.5
-    y = (1 - corners[triangles, :, 1]) * resolution - 0.5
-    left, across = span(x.T, resolution)
-    top, down = span(y.T, resolution)
-    owner, column, row = grid_points(across * down, left, top, across)
-    orientation = np.sign(
-        (x[:, 1] - x[:, 0]) * (y[:, 2] - y[:, 0]) - (y[:, 1] - y[:, 0]) * (x[:, 2] - x[:, 0])
-    )
-    sides = np.empty((len(owner), 3))
-    for k, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
-        swap = (x[:, j] < x[:, i]) | ((x[:, j] == x[:, i]) & (y[:, j] < y[:, i]))
-        ax = np.where(swap, x[:, j], x[:, i])
-        ay = np.where(swap, y[:, j], y[:, i])
-        dx = np.where(swap, x[:, i], x[:, j]) - ax
-        dy = np.where(swap, y[:, i], y[:, j]) - ay
-        sign = np.where(swap, -orientation, orientation)
-        sides[:, k] = sign[owner] * (
-            dx[owner] * (row - ay[owner]) - dy[owner] * (column - ax[owner])
-        )
-    inside = (sides >= 0).all(1)
-    texels, first = np.unique((row * resolution + column)[inside], return_index=True)
-    barycentric = sides[inside][first]
-    barycentric /= barycentric.sum(1, keepdims=True)
-    rows = (texels.astype(np.int64), triangles[owner[inside][first]].astype(np.int64), barycentric)
-    index, faces, coordinates = (torch.from_numpy(x).to(corners_uv.device) for x in rows)
-    return index, faces, coordinates
+    corners = corners_uv.cpu().numpy()[triangles]
+    corners = corners * [resolution, -resolution, 1] + [-0.5, resolution - 0.5, 0]
+    texels = rasterize(corners, resolution, resolution)
+    rows = (texels.index, triangles[texels.faces], texels.barycentric)
+    index, faces, barycentric = (torch.from_numpy(x).to(corners_uv.device) for x in rows)
+    return index, faces, barycentric
 
 
 def _interpolated(barycentric: Tensor, around: Tensor, values: Tensor) -> Tensor:

@@ -24,18 +24,22 @@ def rasterize(corners: np.ndarray, width: int, height: int) -> Fragments:
     """Return the nearest triangle at every covered grid point (integer column and row).
 
     ``corners`` (T, 3, 3) are column, row and inverse depth, which is linear in the image (1 for an
-    orthographic view). Edges belong to both triangles; degenerate triangles cover nothing.
+    orthographic view). Edges belong to both triangles, and the first of equally near triangles is
+    returned; degenerate triangles cover nothing.
     """
     x, y, near = np.ascontiguousarray(corners.transpose(2, 1, 0))
-    left, across = span(x, width)
-    top, down = span(y, height)
+    left, across = _span(x, width)
+    top, down = _span(y, height)
     candidates = np.flatnonzero(across * down)  # in small images most triangles cover no grid point
     (x0, x1, x2), (y0, y1, y2), left, across, top, down = (
         v[..., candidates] for v in (x, y, left, across, top, down)
     )
     area = (x1 - x0) * (y2 - y0) - (y1 - y0) * (x2 - x0)
     counts = np.where(area != 0, across * down, 0)
-    owner, column, row = grid_points(counts, left, top, across)
+    owner = np.repeat(np.arange(len(counts)), counts)
+    within = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
+    column = left[owner] + within % across[owner]
+    row = top[owner] + within // across[owner]
     right = column - x0[owner]
     below = row - y0[owner]
     second = (right * (y2 - y0)[owner] - below * (x2 - x0)[owner]) / area[owner]
@@ -43,14 +47,15 @@ def rasterize(corners: np.ndarray, width: int, height: int) -> Fragments:
     barycentric = np.stack([1.0 - second - third, second, third])
     # The tolerance avoids gaps between neighbouring triangles.
     inside = barycentric.min(axis=0) >= -1e-9
-    barycentric = barycentric[:, inside]
     owner = candidates[owner[inside]]
     index = (row * width + column)[inside]
-    barycentric = barycentric * near[:, owner]
+    barycentric = barycentric[:, inside].clip(0.0) * near[:, owner]
     inverse = barycentric.sum(axis=0)
+    # Without rounding, chance would decide between triangles of the same depth.
+    rounded = inverse.round(12)
     nearest = np.zeros(width * height)
-    np.maximum.at(nearest, index, inverse)
-    first = np.flatnonzero(inverse == nearest[index])
+    np.maximum.at(nearest, index, rounded)
+    first = np.flatnonzero(rounded == nearest[index])
     index, chosen = np.unique(index[first], return_index=True)
     first = first[chosen]
     return Fragments(index, owner[first], (barycentric[:, first] / inverse[first]).T)
@@ -76,19 +81,7 @@ def normalized(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
 
 
-def grid_points(
-    counts: np.ndarray, left: np.ndarray, top: np.ndarray, across: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return triangle, column and row of all grid points in the bounding boxes of T triangles.
-
-    ``counts`` are the points per box, ``across`` those per row of it.
-    """
-    owner = np.repeat(np.arange(len(counts)), counts)
-    within = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
-    return owner, left[owner] + within % across[owner], top[owner] + within // across[owner]
-
-
-def span(ends: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+def _span(ends: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the first integer in [0, size) within the extent of triangles (3, T), and their
     number."""
     first = np.ceil(ends.min(axis=0) - 1e-6).clip(0, size).astype(np.int64)
