@@ -150,14 +150,10 @@ def _areas(corners: Tensor) -> Tensor:
 def _vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     """Return unit vertex normals (M, 3), weighted by angle (Thürmer and Wüthrich 1998); 0 without
     faces."""
-    corners = vertices[faces]
-    flat = _unit_or(_cross(corners), corners.new_zeros(3))
-    ahead = _unit_or(corners.roll(-1, 1) - corners, corners.new_zeros(3))
-    cosines = -(ahead * ahead.roll(1, 1)).sum(-1)
-    total = torch.zeros_like(vertices)
-    for k in range(3):
-        total.index_add_(0, faces[:, k], flat * cosines[:, k].clamp(-1, 1).acos()[:, None])
-    return _unit_or(total, corners.new_zeros(3))
+    import trimesh
+
+    mesh = trimesh.Trimesh(vertices.cpu().numpy(), faces.cpu().numpy(), process=False)
+    return torch.tensor(mesh.vertex_normals, dtype=vertices.dtype, device=vertices.device)
 
 
 def _along_u(corners: Tensor, corners_uv: Tensor) -> Tensor:
