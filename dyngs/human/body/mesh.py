@@ -18,6 +18,7 @@ class Fragments:
     index: np.ndarray  # (H,) row * width + column
     faces: np.ndarray  # (H,) int64 triangle
     barycentric: np.ndarray  # (H, 3) perspective-correct, rows sum to 1
+    depth: np.ndarray  # (H,)
 
 
 def rasterize(corners: np.ndarray, width: int, height: int) -> Fragments:
@@ -58,7 +59,8 @@ def rasterize(corners: np.ndarray, width: int, height: int) -> Fragments:
     first = np.flatnonzero(rounded == nearest[index])
     index, chosen = np.unique(index[first], return_index=True)
     first = first[chosen]
-    return Fragments(index, owner[first], (barycentric[:, first] / inverse[first]).T)
+    depth = 1.0 / inverse[first]
+    return Fragments(index, owner[first], (barycentric[:, first] * depth).T, depth)
 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -2,22 +2,21 @@
 parameters.
 
 Rendered by the NumPy mesh rasteriser, independently of the Gaussian rasteriser. Symbols: F frames,
-M vertices, T triangles, U UV vertices, P points, H fragments, S texels or pixels per side.
+M vertices, T triangles, P points, H fragments, S pixels per side.
 """
 
 from __future__ import annotations
 
 import colorsys
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 import torch
 from scipy.interpolate import PchipInterpolator
-from scipy.ndimage import distance_transform_edt, map_coordinates
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -35,6 +34,8 @@ from dyngs.human.motion.motion import Motion
 from dyngs.io.outputs import atomic_folder, require_new_folder
 from dyngs.io.write import write_image, write_text
 
+Paint = Callable[[Fragments], np.ndarray]
+"""sRGB values (H, 3) in [0, 1] of visible points of a surface."""
 FPS = 12.0
 _Rotations = dict[str, np.ndarray]  # axis-angle vectors (F, 3) or (1, 3) by joint, rad
 _SIDES = (("left", 1.0), ("right", -1.0))
@@ -313,48 +314,23 @@ def _with_skirt(
     return vertices + share * shift, weights + share * (0.5 - 0.5 * np.cos(angle))[:, None] * other
 
 
-def paint_texture(body: BodyTemplate, outfit: Outfit, resolution: int = 512) -> np.ndarray:
-    """Paint the texture (S, S, 3) of ``outfit``, sRGB in [0, 1], float64.
+def outfit_paint(body: BodyTemplate, outfit: Outfit) -> Paint:
+    """Return the colours of ``outfit`` as a function of surface points of ``body``.
 
-    Uncovered texels repeat the nearest covered one, for interpolation at seams. The template is in
-    T-pose, with a UV map and the 55 joints of SMPL-X.
+    The template is in T-pose and has the 55 joints of SMPL-X.
     """
-    fragments, nearest = _covered(body.uv, body.uv_faces, resolution)
-    around = body.faces.cpu().numpy()[fragments.faces]
-    points = interpolate(fragments.barycentric, body.vertices.double().cpu().numpy()[around])
-    parts = interpolate(fragments.barycentric, _part_weights(body)[around]).argmax(axis=1)
-    texture = np.zeros((resolution * resolution, 3))
-    texture[fragments.index] = _painted(
-        points, np.array(list(_PARTS))[parts], _left_eye(body), outfit
-    )
-    return texture[nearest]
+    faces = body.faces.cpu().numpy()
+    vertices = body.vertices.double().cpu().numpy()
+    weights = _part_weights(body)
+    names = np.array(list(_PARTS))
 
+    def paint(fragments: Fragments) -> np.ndarray:
+        around = faces[fragments.faces]
+        points = interpolate(fragments.barycentric, vertices[around])
+        parts = interpolate(fragments.barycentric, weights[around]).argmax(axis=1)
+        return _painted(points, names[parts], _left_eye(body), outfit)
 
-@lru_cache(maxsize=1)  # people of a set share one UV map
-def _covered(uv: Tensor, uv_faces: Tensor, resolution: int) -> tuple[Fragments, np.ndarray]:
-    """Return the covered texels of the UV map, and the nearest covered texel (S, S) of each."""
-    columns, rows = texel_coordinates(uv.double().cpu().numpy(), resolution)
-    corners = np.stack([columns, rows, np.ones_like(rows)], axis=-1)[uv_faces.cpu().numpy()]
-    fragments = rasterize(corners, resolution, resolution)
-    is_bare = np.ones(resolution * resolution, dtype=bool)
-    is_bare[fragments.index] = False
-    near = distance_transform_edt(
-        is_bare.reshape(resolution, -1), return_distances=False, return_indices=True
-    )
-    row, column = np.asarray(near)
-    return fragments, row * resolution + column
-
-
-def texture_coordinates(body: BodyTemplate) -> tuple[np.ndarray, np.ndarray]:
-    """Return UV coordinates (U, 2), float64, and their triangles (T, 3)."""
-    assert body.uv is not None
-    assert body.uv_faces is not None
-    return body.uv.double().cpu().numpy(), body.uv_faces.cpu().numpy()
-
-
-def texel_coordinates(uv: np.ndarray, resolution: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return column and row (U,) of ``uv`` (U, 2) in a texture; integers are texel centres."""
-    return uv[:, 0] * resolution - 0.5, (1.0 - uv[:, 1]) * resolution - 0.5
+    return paint
 
 
 def _left_eye(body: BodyTemplate) -> np.ndarray:
@@ -523,13 +499,11 @@ class HumanOptions:
 
 @dataclass(frozen=True)
 class PosedMesh:
-    """Textured mesh in world coordinates; float64, m."""
+    """Painted mesh in world coordinates; float64, m."""
 
     vertices: np.ndarray  # (M, 3) in the world
     faces: np.ndarray  # (T, 3) int64, counter-clockwise from outside
-    uv: np.ndarray  # (U, 2) in [0, 1]; row of the texture = (1 - v) * S
-    uv_faces: np.ndarray  # (T, 3) int64 into ``uv``
-    texture: np.ndarray  # (S, S, 3) sRGB values in [0, 1]
+    paint: Paint  # sRGB values in [0, 1] of the surface
 
     @cached_property
     def normals(self) -> np.ndarray:
@@ -550,7 +524,9 @@ def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Pa
     if least < 1:
         raise DyngsError("a synthetic person needs size, frames and cameras >= 1 and seed >= 0")
     body, betas = _person(options.body_seed)
-    outfit, clothed, texture = _dressed(body, options.seed, options.everyday_clothes)
+    outfit = random_outfit(options.seed, options.everyday_clothes)
+    clothed = dress_body(body, outfit)
+    paint = outfit_paint(body, outfit)
     train, test = ring_cameras(options)
     light = random_light(options.scene_seed)
     error = np.random.default_rng([options.seed, 7]).normal(0, options.body_error, betas.shape)
@@ -564,7 +540,7 @@ def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Pa
             motion = replace(
                 clip, trans=outfit.size * clip.trans, scale=outfit.size * clip.scale, betas=betas
             )
-            meshes = _posed_meshes(clothed, motion, texture)
+            meshes = _posed_meshes(clothed, motion, paint)
             for split, cameras in splits.items():
                 write_split(started, split, meshes, cameras, options, light)
             layout = "smpl" if options.body_seed is None else "anny"
@@ -582,15 +558,6 @@ def _person(seed: int | None) -> tuple[BodyTemplate, Tensor]:
     )
     vertices, joints = apply_shape(body, betas)
     return replace(body, vertices=vertices, joints=joints), betas
-
-
-@lru_cache(maxsize=4)  # shared by captures of one person
-def _dressed(
-    body: BodyTemplate, seed: int, everyday_clothes: bool
-) -> tuple[Outfit, BodyTemplate, np.ndarray]:
-    """Return the outfit of ``seed``, the clothed body, and its texture (S, S, 3)."""
-    outfit = random_outfit(seed, everyday_clothes)
-    return outfit, dress_body(body, outfit), paint_texture(body, outfit)
 
 
 def random_light(seed: int | None) -> DirectionalLight:
@@ -624,7 +591,7 @@ def render_mesh(
 ) -> np.ndarray:
     """Render a mesh; return sRGB values and straight alpha (size, size, 4) in [0, 1].
 
-    Lambertian: texture times ambient + diffuse max(n . l, 0), at most 1, with smooth normals n.
+    Lambertian: paint times ambient + diffuse max(n . l, 0), at most 1, with smooth normals n.
     Anti-aliased with ``samples`` x ``samples`` per pixel.
 
     Args:
@@ -633,28 +600,26 @@ def render_mesh(
         size: width and height, px.
         samples: per pixel and axis.
         light: of the scene.
-
-    Raises:
-        ValueError: the mesh reaches behind the camera.
     """
-    image = _image_of(mesh.vertices, world_from_cam, size)
-    corners = image[mesh.faces]
-    sums = np.zeros((size * size, 4))
-    for k in range(samples * samples):
-        sample = np.array([(k % samples + 0.5) / samples, (k // samples + 0.5) / samples, 0.0])
-        fragments = rasterize(corners - sample, size, size)
-        sums[fragments.index, :3] += _shaded(mesh, fragments, light)
-        sums[fragments.index, 3] += 1.0
-    rgb = sums[:, :3] / np.maximum(sums[:, 3:], 1.0)
-    return np.concatenate([rgb, sums[:, 3:] / samples**2], axis=1).reshape(size, size, 4)
+    wide = size * samples
+    image = _image_of(mesh.vertices, world_from_cam, wide) - [0.5, 0.5, 0.0]
+    fragments = rasterize(image[mesh.faces], wide, wide)
+    around = mesh.normals[mesh.faces[fragments.faces]]
+    normal = normalized(interpolate(fragments.barycentric, around))
+    facing = np.maximum(normal @ normalized(np.array(light.direction)), 0.0)
+    received = np.array(light.ambient) + np.array(light.diffuse) * facing[:, None]
+    terms = np.hstack([normal, normal**2, normal * np.roll(normal, 1, axis=1)])
+    sums = np.zeros((wide * wide, 4))
+    sums[fragments.index, :3] = mesh.paint(fragments) * (received + terms @ np.array(light.sky))
+    sums[fragments.index, 3] = 1.0
+    sums = sums.clip(0.0, 1.0).reshape(size, samples, size, samples, 4).sum(axis=(1, 3))
+    alpha = sums[..., 3:]
+    return np.concatenate([sums[..., :3] / np.maximum(alpha, 1.0), alpha / samples**2], axis=-1)
 
 
 def _image_of(points: np.ndarray, world_from_cam: np.ndarray, size: int) -> np.ndarray:
-    """Project ``points`` (P, 3) to column, row and inverse depth (P, 3). Raises ValueError: one
-    lies behind."""
+    """Project ``points`` (P, 3) before the camera to column, row and inverse depth (P, 3)."""
     x, up, back = ((points - world_from_cam[:3, 3]) @ world_from_cam[:3, :3]).T
-    if not (back < 0).all():
-        raise ValueError("all vertices must be in front of the camera")
     focal = _focal(size)
     return np.stack(
         [0.5 * size - focal * x / back, 0.5 * size + focal * up / back, -1.0 / back], axis=-1
@@ -704,19 +669,17 @@ def write_split(
 def _depth_map(mesh: PosedMesh, world_from_cam: np.ndarray, size: int) -> np.ndarray:
     """Return the depth (S, S) along the view axis at pixel centres, m; 0 in the background."""
     image = _image_of(mesh.vertices, world_from_cam, size) - [0.5, 0.5, 0.0]
-    surface = rasterize(image[mesh.faces], size, size)
+    fragments = rasterize(image[mesh.faces], size, size)
     depth = np.zeros(size * size)
-    corners = 1.0 / image[mesh.faces[surface.faces], 2:]
-    depth[surface.index] = interpolate(surface.barycentric, corners)[:, 0]
+    depth[fragments.index] = fragments.depth
     return depth.reshape(size, size)
 
 
-def _posed_meshes(body: BodyTemplate, motion: Motion, texture: np.ndarray) -> list[PosedMesh]:
-    uv, uv_faces = texture_coordinates(body)
+def _posed_meshes(body: BodyTemplate, motion: Motion, paint: Paint) -> list[PosedMesh]:
     poses, trans, scale = (x.double() for x in (motion.poses, motion.trans, motion.scale))
     posed = posed_vertices(body.to(dtype=torch.float64), poses, trans, scale=scale).cpu().numpy()
     faces = body.faces.cpu().numpy()
-    return [PosedMesh(vertices, faces, uv, uv_faces, texture) for vertices in posed]
+    return [PosedMesh(vertices, faces, paint) for vertices in posed]
 
 
 def ring_cameras(options: HumanOptions) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray]]:
@@ -755,27 +718,6 @@ def _on_ring(fractions: np.ndarray, heights: np.ndarray, radius: float = _RADIUS
 
 def _focal(size: int) -> float:
     return float(0.5 * size / np.tan(0.5 * CAMERA_ANGLE_X))
-
-
-def _shaded(mesh: PosedMesh, fragments: Fragments, light: DirectionalLight) -> np.ndarray:
-    uv = interpolate(fragments.barycentric, mesh.uv[mesh.uv_faces[fragments.faces]])
-    normal = normalized(
-        interpolate(fragments.barycentric, mesh.normals[mesh.faces[fragments.faces]])
-    )
-    facing = np.maximum(normal @ normalized(np.array(light.direction)), 0.0)
-    received = np.array(light.ambient) + np.array(light.diffuse) * facing[:, None]
-    terms = np.hstack([normal, normal**2, normal * np.roll(normal, 1, axis=1)])
-    return (_sampled(mesh.texture, uv) * (received + terms @ np.array(light.sky))).clip(0.0, 1.0)
-
-
-def _sampled(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """Sample a texture (S, S, 3) at ``uv`` (H, 2), bilinear, repeated beyond [0, 1]; return (H,
-    3)."""
-    places = texel_coordinates(uv, len(texture))[::-1]
-    channels = [
-        map_coordinates(x, places, order=1, mode="grid-wrap") for x in np.moveaxis(texture, 2, 0)
-    ]
-    return np.stack(channels, axis=-1)
 
 
 PEOPLE_PER_FOLDER = 100

@@ -7,11 +7,14 @@ from typing import Any
 from zlib import crc32
 
 import numpy as np
+from scipy.ndimage import map_coordinates
 
 from dyngs.core.conventions import ProgressCallback, ignore_progress
 from dyngs.core.errors import DyngsError, wrap_read_errors
+from dyngs.human.body.mesh import Fragments, interpolate
 from dyngs.human.synthetic.capture import (
     DirectionalLight,
+    Paint,
     PeopleOptions,
     PosedMesh,
     open_people_set,
@@ -85,19 +88,42 @@ def read_scan(path: Path) -> PosedMesh:
         )
     placed = (vertices - low - 0.5 * np.array([width, 0.0, depth])) * (_HEIGHT / height)
     faces = np.asarray(mesh.faces)
-    return PosedMesh(placed, faces, uv, faces, texture)
+    return PosedMesh(placed, faces, texture_paint(uv, faces, texture))
+
+
+def texture_paint(uv: np.ndarray, uv_faces: np.ndarray, texture: np.ndarray) -> Paint:
+    """Return a paint that samples a texture, bilinear, repeated beyond [0, 1].
+
+    Args:
+        uv: (U, 2) coordinates; row of the texture = (1 - v) * height.
+        uv_faces: (T, 3) indices into ``uv``.
+        texture: (height, width, 3) sRGB values in [0, 1].
+    """
+    height, width, _ = texture.shape
+
+    def paint(fragments: Fragments) -> np.ndarray:
+        u, v = interpolate(fragments.barycentric, uv[uv_faces[fragments.faces]]).T
+        places = ((1.0 - v) * height - 0.5, u * width - 0.5)
+        channels = [
+            map_coordinates(channel, places, order=1, mode="grid-wrap")
+            for channel in np.moveaxis(texture, 2, 0)
+        ]
+        return np.stack(channels, axis=-1)
+
+    return paint
 
 
 def _texture(path: Path, material: Any) -> np.ndarray:
-    """Return the texture (S, S, 3) of the material of a scan, else of an image beside it."""
+    """Return the texture (height, width, 3) of the material of a scan, else of an image beside it."""
     from PIL import Image
 
     image = getattr(material, "image", getattr(material, "baseColorTexture", None))
     # trimesh has an image of 2 x 2 px in place of a missing one.
     if image is None or max(image.size) <= 2:
         image = Image.open(_image_beside(path))
-    side = min(max(image.size), _MAX_TEXTURE)
-    return np.asarray(image.convert("RGB").resize((side, side))) / 255.0
+    image = image.convert("RGB")
+    image.thumbnail((_MAX_TEXTURE, _MAX_TEXTURE))
+    return np.asarray(image) / 255.0
 
 
 def _image_beside(path: Path) -> Path:

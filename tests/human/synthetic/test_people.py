@@ -17,6 +17,7 @@ from dyngs.data.read import list_captures
 from dyngs.human.body.body import posed_vertices
 from dyngs.human.body.body_reader import default_template
 from dyngs.human.body.joints import JOINT_NAMES
+from dyngs.human.body.mesh import Fragments
 from dyngs.human.synthetic.capture import (
     DirectionalLight,
     PeopleOptions,
@@ -25,7 +26,6 @@ from dyngs.human.synthetic.capture import (
     person_options,
     random_outfit,
     render_mesh,
-    texture_coordinates,
     write_human_capture,
     write_people,
 )
@@ -37,6 +37,10 @@ SMALL = PeopleOptions(people=2, size=64, cameras=3)
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_people(tmp_path_factory.mktemp("people") / "set", SMALL)
+
+
+def grey(fragments: Fragments) -> np.ndarray:
+    return np.full((len(fragments.index), 3), 0.5)
 
 
 def contents(root: Path) -> dict[str, bytes]:
@@ -119,8 +123,7 @@ def test_a_skirt_closes_the_gap_between_the_legs_in_every_pose() -> None:
         clothed = dress_body(body, outfit)
         torch.testing.assert_close(clothed.weights.sum(1), torch.ones(len(clothed.weights)))
         vertices = posed_vertices(clothed, poses, torch.zeros(1, 3))[0].double().numpy()
-        uv, uv_faces = texture_coordinates(body)
-        mesh = PosedMesh(vertices, body.faces.numpy(), uv, uv_faces, np.ones((4, 4, 3)))
+        mesh = PosedMesh(vertices, body.faces.numpy(), grey)
         shown.append(render_mesh(mesh, camera, 128, 1)[..., 3] > 0)
     rows = {name: 64 + round(-y * 0.5 * 128 / np.tan(0.3456) / 3.5) for name, y in HEIGHTS.items()}
     assert not shown[0][rows["knee"], 64]
@@ -150,7 +153,7 @@ def test_the_sky_adds_a_quadratic_polynomial_of_the_normal() -> None:
     """Flat triangle that faces the camera: n = (0, 0, 1), so that n_z and n_z^2 are 1."""
     corners = np.array([[-9.0, -9, 0], [9, -9, 0], [0, 9, 0]])
     faces = np.array([[0, 1, 2]])
-    mesh = PosedMesh(corners, faces, np.full((3, 2), 0.5), faces, np.full((2, 2, 3), 0.5))
+    mesh = PosedMesh(corners, faces, grey)
     sky = np.zeros((9, 3))
     sky[2] = 0.1, 0.2, 0.3
     sky[5] = 0.4

@@ -21,7 +21,7 @@ from dyngs.human.body.atlas import Texels, atlas_texels
 from dyngs.human.body.body import BodyTemplate, posed_vertices
 from dyngs.human.body.body_reader import default_template
 from dyngs.human.body.joints import JOINT_NAMES
-from dyngs.human.body.mesh import interpolate, rasterize
+from dyngs.human.body.mesh import Fragments, interpolate
 from dyngs.human.keys import HumanPredictorModel
 from dyngs.human.predict.ghg.network import (
     MAX_SILHOUETTE_DISTANCE,
@@ -32,10 +32,9 @@ from dyngs.human.predict.ghg.network import (
 )
 from dyngs.human.predict.people import captured_person
 from dyngs.human.synthetic.capture import (
+    Paint,
     PosedMesh,
     render_mesh,
-    texel_coordinates,
-    texture_coordinates,
 )
 
 
@@ -95,28 +94,26 @@ def arms_before_the_chest() -> Tensor:
     return poses
 
 
-def painted(colour_of: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> np.ndarray:
-    """(256, 256, 3) texture by positions (P, 3) of the T-pose and the joint (P,) that moves
-    each."""
-    uv, uv_faces = texture_coordinates(body())
-    columns, rows = texel_coordinates(uv, 256)
-    fragments = rasterize(
-        np.stack([columns, rows, np.ones_like(rows)], axis=-1)[uv_faces], 256, 256
-    )
-    around = body().faces.numpy()[fragments.faces]
-    positions = interpolate(fragments.barycentric, body().vertices.double().numpy()[around])
-    joints = interpolate(fragments.barycentric, body().weights.double().numpy()[around]).argmax(1)
-    texture = np.full((256 * 256, 3), 0.5)
-    texture[fragments.index] = colour_of(positions, joints)
-    return texture.reshape(256, 256, 3)
+def painted(colour_of: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Paint:
+    """Paint by positions (P, 3) of the T-pose and the joint (P,) that moves each."""
+
+    def paint(fragments: Fragments) -> np.ndarray:
+        around = body().faces.numpy()[fragments.faces]
+        positions = interpolate(fragments.barycentric, body().vertices.double().numpy()[around])
+        weights = interpolate(fragments.barycentric, body().weights.double().numpy()[around])
+        return colour_of(positions, weights.argmax(1))
+
+    return paint
 
 
-def image(poses: Tensor, texture: np.ndarray, pose: np.ndarray) -> Image:
-    exact, (uv, uv_faces) = body().to(dtype=torch.float64), texture_coordinates(body())
+def grey(fragments: Fragments) -> np.ndarray:
+    return np.full((len(fragments.index), 3), 0.5)
+
+
+def image(poses: Tensor, paint: Paint, pose: np.ndarray) -> Image:
+    exact = body().to(dtype=torch.float64)
     vertices = posed_vertices(exact, poses[None].double(), torch.zeros(1, 3).double())[0].numpy()
-    pixels = render_mesh(
-        PosedMesh(vertices, body().faces.numpy(), uv, uv_faces, texture), pose, SIZE, 2
-    )
+    pixels = render_mesh(PosedMesh(vertices, body().faces.numpy(), paint), pose, SIZE, 2)
     rgba = torch.from_numpy(pixels).float()
     focal = 0.5 * SIZE / np.tan(0.5 * CAMERA_ANGLE_X)
     intrinsics = torch.tensor([[focal, 0, SIZE / 2], [0, focal, SIZE / 2], [0, 0, 1]]).float()
@@ -136,7 +133,7 @@ def test_distances_from_the_edge_are_those_of_the_outline() -> None:
     """From the front, texels on the outer side of the legs lie on it, and those 4 cm above them 4
     cm outside."""
     shown = sitter(torch.zeros(55, 3))
-    seen = image(torch.zeros(55, 3), np.full((4, 4, 3), 0.5), FRONT)
+    seen = image(torch.zeros(55, 3), grey, FRONT)
     maps = observe_texels(shown, [seen])
     points = shown.texels.points
     normals = shown.texels.normals
@@ -159,18 +156,18 @@ def test_texels_behind_an_arm_do_not_get_its_colour() -> None:
     """Arms red, the rest blue: of the texels seen, nearly all have their own colour, and parts of
     the chest are hidden that are seen when the arms are aside. Mixed colours remain where a pixel
     covers both."""
-    texture = painted(
+    paint = painted(
         lambda _, joints: np.where(is_arm(joints)[:, None], [0.9, 0.0, 0.0], [0.0, 0.0, 0.9])
     )
     crossed = sitter(arms_before_the_chest())
-    maps = observe_texels(crossed, [image(arms_before_the_chest(), texture, FRONT)])
+    maps = observe_texels(crossed, [image(arms_before_the_chest(), paint, FRONT)])
     arms = torch.from_numpy(is_arm(crossed.texels.weights.argmax(1)))
     redness = maps.rgb[0, :, 0] / maps.rgb[0].sum(1).clamp_min(1e-6)
     seen = maps.seen[0] > 0.3
     assert (redness[seen & arms] > 0.5).float().mean() > 0.9, "fingers are thinner than a pixel"
     assert (redness[seen & ~arms] < 0.5).float().mean() > 0.98
     aside = sitter(torch.zeros(55, 3))
-    free = observe_texels(aside, [image(torch.zeros(55, 3), texture, FRONT)])
+    free = observe_texels(aside, [image(torch.zeros(55, 3), paint, FRONT)])
     x, y, _ = aside.texels.points.T
     chest = (free.seen[0] > 0.8) & ~arms & (x.abs() < 0.2) & ((y - 0.55).abs() < 0.08)
     assert (maps.seen[0][chest] == 0).float().mean() > 0.1, "forearms cover a part of it"
@@ -179,9 +176,9 @@ def test_texels_behind_an_arm_do_not_get_its_colour() -> None:
 def test_a_texel_has_the_colour_of_its_place() -> None:
     """A smooth colour over the body, from two sides; up to the light and half a pixel of its
     change."""
-    texture = painted(lambda positions, _: 0.5 + 0.4 * np.sin(3 * positions))
+    paint = painted(lambda positions, _: 0.5 + 0.4 * np.sin(3 * positions))
     aside = sitter(torch.zeros(55, 3))
-    shown = [image(torch.zeros(55, 3), texture, pose) for pose in (FRONT, RIGHT)]
+    shown = [image(torch.zeros(55, 3), paint, pose) for pose in (FRONT, RIGHT)]
     maps = observe_texels(aside, shown)
     seen = maps.seen[0] > 0.5
     truth = 0.5 + 0.4 * torch.sin(3 * aside.texels.points)
