@@ -459,11 +459,6 @@ def _painted(points: np.ndarray, part: np.ndarray, eye: np.ndarray, outfit: Outf
     return rgb.clip(0.0, 1.0)
 
 
-_RADIUS = 3.5  # radius of the ring of cameras, m
-_HEIGHT_JITTER = 0.08  # of cameras on a random ring, m
-_TARGET = np.array([0.0, 0.95, 0.0])  # point that all cameras look at, m
-
-
 @dataclass(frozen=True)
 class DirectionalLight:
     """Directional light plus ambient light and the light of a sky."""
@@ -489,11 +484,10 @@ class HumanOptions:
     seed: int = 0  # of the outfit, see ``random_outfit``; output is reproducible to the byte
     samples: int = 2  # per pixel and axis
     body_seed: int | None = None  # of the body shape; None: that of the template
-    # of light, motions (see ``_clip``) and camera ring; None: default light, a walk, then a squat,
-    # and cameras alternately low and high at 3.5 m
+    # of light, motions (see ``_clip``) and camera ring, with depth maps; None: default light, a
+    # walk, then a squat, and cameras alternately low and high at 3.5 m
     scene_seed: int | None = None
     everyday_clothes: bool = False  # see ``random_outfit``
-    with_depth: bool = False  # write depth maps
     body_error: float = 0.0  # standard deviation of errors of the written shape parameters
 
 
@@ -527,7 +521,9 @@ def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Pa
     outfit = random_outfit(options.seed, options.everyday_clothes)
     clothed = dress_body(body, outfit)
     paint = outfit_paint(body, outfit)
-    train, test = ring_cameras(options)
+    cameras = dict(enumerate(ring_cameras(options)))
+    train = {number: pose for number, pose in cameras.items() if number < options.num_cameras}
+    test = {number: pose for number, pose in cameras.items() if number >= options.num_cameras}
     light = random_light(options.scene_seed)
     error = np.random.default_rng([options.seed, 7]).normal(0, options.body_error, betas.shape)
     betas = betas + torch.from_numpy(error).to(betas)
@@ -652,7 +648,7 @@ def write_split(
                 "camera": camera,
                 "time": i / max(len(meshes) - 1, 1),
             }
-            if options.with_depth:
+            if options.scene_seed is not None:
                 entry["depth_file_path"] = f"depth/{name}"
                 depth = _depth_map(mesh, pose, size)
                 write_image(out / "depth" / name, (depth / MILLIMETRE + 0.5).astype(np.uint16))
@@ -682,34 +678,20 @@ def _posed_meshes(body: BodyTemplate, motion: Motion, paint: Paint) -> list[Pose
     return [PosedMesh(vertices, faces, paint) for vertices in posed]
 
 
-def ring_cameras(options: HumanOptions) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray]]:
-    """Return the OpenGL poses (4, 4) of training and test cameras by number, on a ring."""
+def ring_cameras(options: HumanOptions) -> np.ndarray:
+    """Return the OpenGL poses (V, 4, 4), y up, of training and then test cameras on a ring."""
     count = options.num_cameras
-    num_test = options.num_test
-    train_fractions = np.arange(count) / max(count, 1)
-    test_fractions = (np.arange(num_test) * count // max(num_test, 1) + 0.5) / count
-    if options.scene_seed is None:
-        train = _on_ring(train_fractions, np.where(np.arange(count) % 2 == 0, 0.9, 1.7))
-        test = _on_ring(test_fractions, np.full(num_test, 1.3))
-    else:
+    tests = np.arange(options.num_test) * count // max(options.num_test, 1)
+    azimuths = 2 * np.pi / count * np.append(np.arange(count), tests + 0.5)
+    radius = 3.5
+    heights = np.where(np.arange(len(azimuths)) % 2 == 0, 0.9, 1.7)
+    heights[count:] = 1.3
+    if options.scene_seed is not None:
         generator = np.random.default_rng([options.scene_seed, 5])
         radius = generator.uniform(3.0, 4.2)
-        height = generator.uniform(0.7, 1.6)
-        train = _on_ring(
-            train_fractions,
-            height + generator.uniform(-_HEIGHT_JITTER, _HEIGHT_JITTER, count),
-            radius,
-        )
-        test = _on_ring(test_fractions, np.full(num_test, height), radius)
-    return dict(enumerate(train)), {len(train) + i: pose for i, pose in enumerate(test)}
-
-
-def _on_ring(fractions: np.ndarray, heights: np.ndarray, radius: float = _RADIUS) -> np.ndarray:
-    """Return OpenGL poses (V, 4, 4), y up, at ``fractions`` (V,) of a turn from +z to +x, and
-    ``heights`` (V,), m."""
-    azimuths = 2 * np.pi * fractions
+        heights = generator.uniform(0.7, 1.6) + generator.uniform(-0.08, 0.08, len(azimuths))
     centers = np.stack([radius * np.sin(azimuths), heights, radius * np.cos(azimuths)], axis=-1)
-    backward = normalized(centers - _TARGET)
+    backward = normalized(centers - [0.0, 0.95, 0.0])
     right = normalized(np.cross([0.0, 1.0, 0.0], backward))
     poses = np.tile(np.eye(4), (len(centers), 1, 1))
     poses[:, :3] = np.stack([right, np.cross(backward, right), backward, centers], axis=-1)
@@ -734,7 +716,6 @@ class PeopleOptions:
     cameras: int = 24  # on a ring around each person
     frames: int = 1  # per person
     seed: int = 0  # different seeds share no body, outfit, motion, light or camera ring
-    body_error: float = 0.15  # see ``HumanOptions``; bodies of captures are estimates, too
 
 
 def write_people(
@@ -791,6 +772,5 @@ def person_options(options: PeopleOptions, number: int) -> HumanOptions:
         body_seed=seed,
         scene_seed=seed,
         everyday_clothes=number % 4 > 0,
-        with_depth=True,
-        body_error=options.body_error,
+        body_error=0.15,  # bodies of captures are estimates, too
     )

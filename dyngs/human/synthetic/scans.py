@@ -61,7 +61,12 @@ def write_scans(
             ring = person_options(options, crc32(name.encode()))
             with atomic_folder(person) as started:
                 write_split(
-                    started, "train", [mesh], ring_cameras(ring)[0], ring, _LIGHT_IN_TEXTURE
+                    started,
+                    "train",
+                    [mesh],
+                    dict(enumerate(ring_cameras(ring))),
+                    ring,
+                    _LIGHT_IN_TEXTURE,
                 )
         report("scans", number + 1, len(scans))
     return len(scans)
