@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 _FINGERS = tuple(
     f"{finger}{i}" for finger in ("index", "middle", "pinky", "ring", "thumb") for i in (1, 2, 3)
 )
@@ -28,18 +30,14 @@ def mirrored_joints(count: int) -> tuple[int, ...]:
     other side."""
     names = [JOINT_NAMES[row] for row in SMPLX_ROWS[count]]
     names += ["left_hand", "right_hand"][: count - len(names)]
-    swapped = {"left": "right", "right": "left"}
-    parts = (name.partition("_") for name in names)
-    other = [
-        f"{swapped[side]}_{joint}" if side in swapped else side + bar + joint
-        for side, bar, joint in parts
-    ]
-    return tuple(names.index(name) for name in other)
+    swap = {"left": "right", "right": "left"}
+    mirrored = [re.sub("^(left|right)", lambda side: swap[side[0]], name) for name in names]
+    return tuple(map(names.index, mirrored))
 
 
 JOINT_PARENTS = (
     *(-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 15, 15, 15),
-    *(20, 25, 26, 20, 28, 29, 20, 31, 32, 20, 34, 35, 20, 37, 38),
-    *(21, 40, 41, 21, 43, 44, 21, 46, 47, 21, 49, 50, 21, 52, 53),
+    # Each finger has three joints; the first one is attached to the left (20) or right wrist.
+    *(row - 1 if row % 3 != 1 else 20 + (row >= 40) for row in range(25, 55)),
 )
 """(55,), -1 for the root."""

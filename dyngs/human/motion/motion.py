@@ -297,5 +297,6 @@ def interpolate_linearly(times: Tensor, values: Tensor, at: Tensor) -> Tensor:
 
 def has_same_parameters(a: BodyFrames, b: BodyFrames) -> bool:
     """True if both hold the same body parameters for the same frames."""
-    pairs = ((getattr(a, name), getattr(b, name)) for name in ("poses", "trans", "scale"))
-    return a.frames == b.frames and all(np.array_equal(x, y) for x, y in pairs)
+    return a.frames == b.frames and all(
+        np.array_equal(getattr(a, name), getattr(b, name)) for name in ("poses", "trans", "scale")
+    )

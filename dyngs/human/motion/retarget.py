@@ -157,16 +157,6 @@ _BONE_ENDS = {f"{finger}{i}": f"{finger}{i + 1}" for finger in _FINGERS for i in
     "wrist": "middle1",
 }
 """Joints of limbs whose bones are aligned, with the joint at the end of the bone."""
-_FOLLOWS = {
-    f"{finger}{i}": f"{finger}{i - 1}" if i > 1 else "wrist"
-    for finger in _FINGERS
-    for i in (1, 2, 3)
-} | {
-    "foot": "ankle",
-    "elbow": "shoulder",
-    "wrist": "elbow",
-}
-"""Joint that provides the alignment if the end of a joint's own bone is unknown."""
 
 
 def retarget(source: SkeletonMotion, body: BodyTemplate) -> Motion:
@@ -271,7 +261,9 @@ def _alignments(
         if min(lengths) > 1e-9:
             alignments[name] = shortest_arc_rotation(bones[0] / lengths[0], bones[1] / lengths[1])
         else:
-            alignments[name] = alignments.get(f"{side}_{_FOLLOWS.get(joint, '')}", np.eye(3))
+            # The end of the bone is unknown, or the joint is outside limbs. Feet stay level.
+            parent = JOINT_NAMES[JOINT_PARENTS[JOINT_NAMES.index(name)]]
+            alignments[name] = np.eye(3) if joint == "ankle" else alignments.get(parent, np.eye(3))
     return alignments
 
 
