@@ -194,7 +194,8 @@ def estimate_alpha(
         first = _alpha(background, image, mask, usable, shadow, MATTE.outside[0])
         found = ndimage.binary_opening(first > 0.5)
         labels, _ = ndimage.label(found)  # pyright: ignore[reportGeneralTypeIssues]
-        found = np.isin(labels, np.unique(labels[core & found])) & (labels > 0)
+        sizes = np.bincount(labels[core & found], minlength=labels.max() + 1)
+        found &= (sizes > LEAST_FRACTION * sizes.max())[labels]
         if (found & mask).sum() > MATTE.agreed * (found | mask).sum():
             result[i] = _alpha(background, image, found, usable, shadow, MATTE.outside[1])
     return result
@@ -229,7 +230,9 @@ def _alpha(
     near = (_distance(mask) <= MATTE.inside * height) & (
         _distance(~mask) <= max(outside * height, 2)
     )
-    return np.where(near & usable, confidence * ratio + (1 - confidence) * soft, soft)
+    alpha = np.where(near & usable, confidence * ratio + (1 - confidence) * soft, soft)
+    # Noise of single pixels.
+    return ndimage.median_filter(alpha, 3)
 
 
 def _height(mask: np.ndarray) -> int:
