@@ -40,7 +40,7 @@ from dyngs.data.scene_space import normalise_capture
 from dyngs.evaluate.report import evaluate_run, held_out_psnr
 from dyngs.io.outputs import lock_folder
 from dyngs.io.write import to_uint8
-from dyngs.models.kind import PredictsScenes, capability
+from dyngs.models.kind import HasBody, PredictsScenes, capability
 from dyngs.models.views import background_colour
 from dyngs.ops.device import deterministic, keep_freed_memory, select_device
 from dyngs.ops.native import kernel_threads, num_cores
@@ -90,6 +90,7 @@ from dyngs.training.processes import Processes
 from dyngs.training.run_log import RunLog, read_recent_psnr
 from dyngs.training.trainer import Trainer
 
+PICTURES = "pictures"  # folder of the pictures of a person
 _COUNT = "budget.count"  # Name of the limit's state in a checkpoint
 # Largest part of the training time, and seconds, that the PSNR of test views may take
 _EVAL_FRACTION = 0.02
@@ -284,7 +285,10 @@ class _Run:
         )
         self._saved = trainer.done
         self._save_timer = SaveTimer(config.train.save_minutes, stopwatch.seconds)
+        self._body_kind = capability(config.model, HasBody)
         if resumed is None:
+            if self._body_kind is not None:
+                self._body_kind.copy_pictures(config.data, self.folder / PICTURES)
             write_new_config(self.folder, config)
             write_requested_config(self.folder, plan.requested)
             write_record(self.folder, config.data, plan.capture)
@@ -324,6 +328,11 @@ class _Run:
                 )
             for line in self._reached():
                 loop.emit(Message(line))
+            if self._body_kind is not None and isinstance(loop.trainer, Trainer):
+                (self.folder / PICTURES).mkdir(exist_ok=True)
+                scene = loop.trainer.model.scene
+                picture = self._body_kind.write_avatar_picture(scene, self.folder / PICTURES)
+                loop.emit(Message(f"see {picture}"))
         write_requested_config(self.folder, self._plan.requested)
 
     def _save_and_evaluate(self, event: Event) -> None:

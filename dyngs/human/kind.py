@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
 
     from dyngs.config import DataConfig
     from dyngs.data.capture import Capture
+    from dyngs.human.avatar.scene import HumanScene
     from dyngs.models.checkpoint import CheckpointInfo
     from dyngs.models.kind import Restore, Start
     from dyngs.models.renderable import Posable
@@ -59,6 +61,21 @@ class HumanKind(HasGaussians, HasBody):
         return ensure_fitted_body(
             data, section, only_if_needed=not section.fit, log=log, on_progress=on_progress
         )
+
+    def copy_pictures(self, data: DataConfig, folder: Path) -> None:
+        for source in (data.root, data.body):
+            for name in ("people.png", "detection.png", "fit_overlays.png"):
+                if source is not None and (source / name).is_file():
+                    folder.mkdir(exist_ok=True)
+                    shutil.copy(source / name, folder)
+
+    def write_avatar_picture(self, scene: HumanScene, folder: Path) -> Path:
+        from dyngs.human.avatar.picture import avatar_picture
+        from dyngs.io.write import write_image
+
+        path = folder / "avatar.png"
+        write_image(path, avatar_picture(scene))
+        return path
 
     def play_motion(
         self, section: HumanModel, scene: Posable, info: CheckpointInfo, path: Path

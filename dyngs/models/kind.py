@@ -179,6 +179,14 @@ class HasBody(ModelKind):
         """Detect and fit the body if the capture has no body parameters; return its data config."""
 
     @abstractmethod
+    def copy_pictures(self, data: DataConfig, folder: Path) -> None:
+        """Copy the pictures of detection and fit to a new folder, if there are any."""
+
+    @abstractmethod
+    def write_avatar_picture(self, scene: Any, folder: Path) -> Path:
+        """Write a picture of the trained person to a folder; return its path."""
+
+    @abstractmethod
     def play_motion(
         self, section: Any, scene: Posable, info: CheckpointInfo, path: Path
     ) -> PlayedMotion:
