@@ -8,6 +8,7 @@ import re
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import compress
 from pathlib import Path
 from statistics import fmean
 
@@ -370,26 +371,33 @@ def read_person_capture(
         capture = add_background_masks(capture, work, log)
     if capture.format != FORMAT and inputs.masks is None:
         return capture
-    # Estimated masks may be empty: skip frames with less than a fifth of the usual area.
-    views = capture.splits["train"]
+    # Estimated masks may be empty: skip views with less than a fifth of the usual area.
+    areas = {split: _silhouette_areas(views, options) for split, views in capture.splits.items()}
+    usual_area = sorted(areas["train"])[len(areas["train"]) * 3 // 4]
+    visible: dict[Split, tuple[View, ...]] = {}
+    skipped: list[str] = []
+    for split, views in capture.splits.items():
+        is_visible = [area > 0.2 * usual_area for area in areas[split]]
+        visible[split] = tuple(compress(views, is_visible))
+        skipped += [view.name for view, kept in zip(views, is_visible, strict=True) if not kept]
+    if not visible["train"]:
+        raise DyngsError(f"{capture.root}: the masks are empty; the person must be white")
+    if skipped:
+        log(
+            f"skipped {format_count(len(skipped), 'view')} with (almost) empty masks, first "
+            f"{skipped[0]}"
+        )
+    return capture.replace(splits={split: views for split, views in visible.items() if views})
+
+
+def _silhouette_areas(views: Sequence[View], options: DataConfig) -> list[float]:
+    """Return the fraction of each image that the silhouette covers."""
     images = ImageLoader(views, _at_most(options, 128))
     areas = []
     for i in range(len(views)):
         alpha = images[i].alpha
         areas.append(0.0 if alpha is None else float(alpha.mean()))
-    median_area = sorted(areas)[len(areas) * 3 // 4]
-    visible = tuple(
-        view for view, area in zip(views, areas, strict=True) if area > 0.2 * median_area
-    )
-    if not visible:
-        raise DyngsError(f"{capture.root}: the masks are empty; the person must be white")
-    if len(visible) < len(views):
-        first_skipped = next(view.name for view in views if view not in visible)
-        log(
-            f"skipped {len(views) - len(visible)} frames with (almost) empty masks, first "
-            f"{first_skipped}"
-        )
-    return capture.replace(splits={**capture.splits, "train": visible})
+    return areas
 
 
 SILHOUETTE_SIDE_PX = 320

@@ -108,8 +108,8 @@ def test_masks_and_key_points_of_all_views(
     assert found.masks is not None
     assert found.keypoints is not None
     seen = [number for number in range(COUNT) if number != 4]
-    # at half the size
-    assert min(overlap(found.masks, number) for number in seen) > (0.93 if side == 960 else 0.7)
+    # The removal of single pixels rounds corners of legs 8 px wide. 80: at half the size.
+    assert min(overlap(found.masks, number) for number in seen) > (0.92 if side == 960 else 0.7)
     assert overlap(found.masks, 4) == 0
     points = read_keypoints(found.keypoints, capture_of(clip).splits["train"])
     assert set(points) == {f"f{number}" for number in seen}
@@ -142,7 +142,7 @@ def test_a_camera_in_which_nobody_is_found_is_left_out(clip: Path, tmp_path: Pat
     assert "warning: camera 1: Rough detects nobody; skipping its images" in said
     assert found.masks is not None
     assert not any(read_image(found.masks / f"{view.name}.png").any() for view in others)
-    assert overlap(found.masks, 2) > 0.93
+    assert overlap(found.masks, 2) > 0.92
 
 
 def test_a_capture_of_the_person_comes_out(clip: Path, tmp_path: Path, short_fits: None) -> None:

@@ -169,7 +169,7 @@ def test_a_plain_clip_gets_masks_and_loses_empty_frames(tmp_path: Path) -> None:
     assert capture.format == FORMAT
     assert capture.has_alpha
     assert [view.name for view in capture.splits["train"]] == [f"f{i:02d}" for i in range(2, 12)]
-    assert any("skipped 2 frames with (almost) empty masks, first f00" in line for line in said)
+    assert any("skipped 2 views with (almost) empty masks, first f00" in line for line in said)
 
 
 def test_photos_and_found_masks_are_written_apart(tmp_path: Path) -> None:
