@@ -126,10 +126,7 @@ def write_fitted_capture(
         is_size_known = capture.body is not None or inputs.joints is not None
         centre = None if is_size_known else _fixed_camera_centre(views)
         if options.stature is not None and centre is None:
-            raise DyngsError(
-                f"data.stature={options.stature:g}: the size of the person in {capture.root} is "
-                "known from several camera positions, or given poses; remove it"
-            )
+            raise _size_is_known(options)
         # The fit starts from the shape of a known person, or from that of the capture.
         known_body = person
         if known_body is None and body.name != "anny" and capture.body is not None:
@@ -230,6 +227,13 @@ def write_fitted_capture(
             "data.stature=METRES sets it"
         )
     return FittedCapture(out, fit, model, "\n".join(lines))
+
+
+def _size_is_known(options: DataConfig) -> DyngsError:
+    return DyngsError(
+        f"data.stature={options.stature:g}: the size of the person in {options.root} is known from "
+        "several camera positions, or from given poses; remove it"
+    )
 
 
 def _fixed_camera_centre(views: Sequence[View]) -> torch.Tensor | None:
@@ -691,6 +695,8 @@ def ensure_fitted_body(
         return data
     capture = read_capture(data)
     body_frames = None if capture.body is None else capture.body["train"]
+    if body_frames is not None and data.stature is not None:
+        raise _size_is_known(data)
     if body_frames is not None and only_if_needed:
         return data
     body = load_template(model)

@@ -15,9 +15,11 @@ from dyngs.capture.fixed_camera import read_fixed_camera
 from dyngs.config import DataConfig
 from dyngs.core.conventions import ignore_progress
 from dyngs.core.errors import DyngsError
+from dyngs.data.body_frames import read_body_file
 from dyngs.data.capture import Capture, all_views
 from dyngs.data.images.images import read_image
 from dyngs.data.read import read_capture
+from dyngs.human.body.body_reader import default_template, rest_shape
 from dyngs.human.detect import detect_person as module
 from dyngs.human.detect.detect_person import (
     detect_person,
@@ -25,6 +27,7 @@ from dyngs.human.detect.detect_person import (
     write_detected_person,
 )
 from dyngs.human.detect.detector import Detection
+from dyngs.human.fit.fitted_capture import ensure_fitted_body, write_fitted_capture
 from dyngs.human.fit.keypoints import JOINTS, read_keypoints
 from dyngs.human.keys import HumanModel
 from dyngs.human.kind import HUMAN
@@ -160,6 +163,29 @@ def test_a_capture_of_the_person_comes_out(clip: Path, tmp_path: Path, short_fit
     )
     with pytest.raises(DyngsError, match=r"exists|not empty"):
         write_detected_person(DataConfig(root=clip), out, Rough(), log=[].append)
+
+
+def test_the_stature_scales_the_person_about_the_camera(
+    clip: Path, tmp_path: Path, short_fits: None
+) -> None:
+    template = default_template()
+    bodies = []
+    for stature in (1.5, 1.8):
+        out = tmp_path / f"ann{stature}"
+        options = DataConfig(root=clip, frames="0:10:4", stature=stature)
+        write_detected_person(options, out, Rough(), log=[].append)
+        body = read_body_file(out / "body_train.npz")
+        vertices, _ = rest_shape(template, body)
+        height = float(vertices[:, 1].max() - vertices[:, 1].min())
+        assert height * body.scale == pytest.approx(stature, rel=1e-4)
+        bodies.append(body)
+    np.testing.assert_allclose(bodies[1].trans, 1.2 * bodies[0].trans, rtol=1e-4)
+    np.testing.assert_array_equal(bodies[1].poses, bodies[0].poses)
+    fitted = DataConfig(root=out, stature=1.8)
+    with pytest.raises(DyngsError, match=r"data.stature=1.8: the size .* is known"):
+        write_fitted_capture(fitted, tmp_path / "again", ignore_progress)
+    with pytest.raises(DyngsError, match=r"data.stature=1.8: the size .* is known"):
+        ensure_fitted_body(fitted)
 
 
 def test_a_clip_is_looked_at_once(
