@@ -24,7 +24,6 @@ from dyngs.api.stages import (
     find_poses,
     read_same_capture,
     run_pilots,
-    run_stages,
     set_limits,
     share_views,
 )
@@ -145,7 +144,7 @@ def train(
     require_losses(config, losses)
     found = None if capture is None else normalise_capture(capture)
     plan = RunPlan(config, config, capture=found, losses=tuple(losses))
-    plan = run_stages(plan, [share_views(processes)])
+    plan = share_views(plan, processes)
     validate_limits(plan.resolved)
     require_loggers(plan.resolved)
     device = select_device(config.run.device)
@@ -153,7 +152,7 @@ def train(
         if not (folder / RESOLVED_NAME).is_file():
             collect_inputs(config).require_output(folder)
         with progress() if progress else nullcontext(ignore_progress) as report:
-            plan = run_stages(plan, [find_poses(report), continue_scene])
+            plan = continue_scene(find_poses(plan, report))
         if config.run.dir is None:
             folder, continued = choose_run(folder, plan.resolved, continues=capture is None)
             if continued is not None:
@@ -176,7 +175,7 @@ def train(
             update_data_root(folder, plan.resolved.data)
             resumed = _newest(folder)
             plan = replace(plan, requested=load_requested_config(folder))
-            plan = run_stages(plan, [extend_run(folder, resumed)])
+            plan = extend_run(plan, folder, resumed)
         if resumed is not None:
             total = plan.resolved.total_steps
             if resumed.info.step >= total and not _is_export_pending(plan.resolved, folder):
@@ -186,15 +185,15 @@ def train(
         images = None
         if resumed is None:
             with progress() if progress else nullcontext(ignore_progress) as report:
-                plan = run_stages(plan, [run_pilots(report)])
-            plan = run_stages(plan, [find_first_gaussians, set_limits])
+                plan = run_pilots(plan, report)
+            plan = set_limits(find_first_gaussians(plan))
             if plan.limits.seconds is not None:
                 plan, message, images = fit_minutes(plan, stopwatch, _built)
                 if message:
                     log_info(message)
         else:
             resumed.require_settings(plan.resolved)
-            plan = run_stages(plan, [read_same_capture(folder, resumed), set_limits])
+            plan = set_limits(read_same_capture(plan, folder, resumed))
             stopwatch.exclude(-seconds_at(folder, resumed.info.step))
         trainer = _built(plan, resumed, images)
         run = _Run(plan, trainer, folder, resumed, processes=processes, stopwatch=stopwatch)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -55,9 +54,6 @@ class RunPlan:
     choices: tuple[Any, ...] = ()
     losses: tuple[AddedLoss, ...] = ()
     is_extended: bool = False
-
-
-Stage = Callable[[RunPlan], tuple[RunPlan, str | None]]
 
 
 def with_steps(config: Config, steps: int) -> Config:

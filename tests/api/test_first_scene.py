@@ -67,7 +67,7 @@ def going_on(capture: Path, run: Path, folder: Path, *more: str, steps: int = 8)
 
 
 def settled(config: Config) -> Config:
-    return continue_scene(RunPlan(config, config))[0].resolved
+    return continue_scene(RunPlan(config, config)).resolved
 
 
 def rows_of(gaussians: Gaussians) -> set[bytes]:

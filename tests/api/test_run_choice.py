@@ -118,7 +118,7 @@ def test_a_longer_time_limit_plans_steps_at_the_same_speed(capture: Path) -> Non
     assert continued is not None
     plan = RunPlan(with_steps(requested, 300), continued)
     checkpoint: Any = SimpleNamespace(info=SimpleNamespace(step=300))
-    plan, _ = extend_run(BASE, checkpoint)(plan)
+    plan = extend_run(plan, BASE, checkpoint)
     assert (plan.resolved.train.steps, plan.resolved.train.minutes) == (900, 3)
     assert (plan.requested.train.steps, plan.requested.train.minutes) == (7000, 3)
     assert choose_run(BASE, requested)[1] is not None, "interrupted, and the same command again"
