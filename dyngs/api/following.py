@@ -7,18 +7,12 @@ a checkpoint. The other ranks need no run folder and write nothing.
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
-from dataclasses import asdict
-from enum import IntEnum
-
-import torch
-from safetensors.torch import load, save
 
 from dyngs.config import Config
-from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
+from dyngs.models.checkpoint import Checkpoint
 from dyngs.ops.device import deterministic, keep_freed_memory, select_device
 from dyngs.ops.native import kernel_threads
 from dyngs.training.events import Event, TopologyChanged
@@ -27,16 +21,10 @@ from dyngs.training.new_trainer import build_trainer
 from dyngs.training.processes import EXIT_INTERRUPTED, Processes
 from dyngs.training.trainer import Trainer
 
-
-class Order(IntEnum):
-    """Command from rank 0 to the other ranks."""
-
-    BUILD = 1
-    """Build the trainer of the configuration that follows."""
-    RESTORE = 2
-    """Restore the checkpoint that follows."""
-    STEP = 3
-    END = 4
+STEP = "step"
+Command = Config | Checkpoint | str | None
+"""Command from rank 0 to the other ranks: build the trainer of a config, restore a checkpoint, train
+for one ``STEP``, or end (None)."""
 
 
 class Leader:
@@ -58,14 +46,13 @@ class Leader:
         if self.processes.size == 1 or not isinstance(trainer, Trainer):
             return
         if not self._has_built:
-            config = json.dumps(self._config.model_dump(mode="json"))
-            _send(self.processes, Order.BUILD, config.encode())
+            self.processes.broadcast(self._config)
             self._has_built = True
             trainer.join(self.processes)
         if self._is_stale:
-            _send(self.processes, Order.RESTORE, _packed(trainer.checkpoint()))
+            self.processes.broadcast(trainer.checkpoint())
             self._is_stale = False
-        _send(self.processes, Order.STEP)
+        self.processes.broadcast(STEP)
 
 
 def run_processes(lead: Callable[[Processes], int]) -> int:
@@ -78,9 +65,9 @@ def run_processes(lead: Callable[[Processes], int]) -> int:
             code = lead(processes)
         except KeyboardInterrupt as stopped:
             if stopped.args:  # between two steps, when the others wait for a command
-                _send(processes, Order.END)
+                processes.broadcast(None)
             raise
-        _send(processes, Order.END)
+        processes.broadcast(None)
     return code
 
 
@@ -96,62 +83,26 @@ def run_follower(processes: Processes) -> bool:
         redirect_stderr(nowhere),
         Interrupts() as interrupts,
     ):
-        order, payload = _receive(processes)
-        while order is Order.BUILD:
-            order, payload = _follow_run(
-                processes, Config.model_validate(json.loads(payload)), interrupts
-            )
+        command: Command = processes.broadcast(None)
+        while isinstance(command, Config):
+            command = _follow_run(processes, command, interrupts)
     return interrupts.requested
 
 
-def _follow_run(
-    processes: Processes, config: Config, interrupts: Interrupts
-) -> tuple[Order, bytes]:
+def _follow_run(processes: Processes, config: Config, interrupts: Interrupts) -> Command:
+    """Train the run of ``config``. Return the first command that belongs to no step of it."""
     bytewise = deterministic(select_device(config.run.device), config.run.deterministic)
     with kernel_threads(config.run.threads or 1), bytewise:
         trainer = build_trainer(config, restored=True)
         trainer.join(processes)
         while True:
-            order, payload = _receive(processes)
+            command: Command = processes.broadcast(None)
             if interrupts.requested:
                 processes.request_stop()
-            match order:
-                case Order.RESTORE:
-                    trainer.restore(_unpacked(payload))
-                case Order.STEP:
-                    trainer.step()
-                case _:
-                    trainer.images.stop_prefetching()
-                    return order, payload
-
-
-def _send(processes: Processes, order: Order, payload: bytes = b"") -> None:
-    if processes.size == 1:
-        return
-    processes.broadcast_(torch.tensor([order, len(payload)], dtype=torch.int64, device="cpu"))
-    if payload:
-        processes.broadcast_(torch.frombuffer(bytearray(payload), dtype=torch.uint8))
-
-
-def _receive(processes: Processes) -> tuple[Order, bytes]:
-    head = torch.zeros(2, dtype=torch.int64, device="cpu")
-    processes.broadcast_(head)
-    order, length = head.tolist()
-    payload = torch.zeros(length, dtype=torch.uint8, device="cpu")
-    if length:
-        processes.broadcast_(payload)
-    return Order(order), payload.numpy().tobytes()
-
-
-def _packed(checkpoint: Checkpoint) -> bytes:
-    tensors = {
-        name: x.detach().cpu().contiguous().clone() for name, x in checkpoint.tensors.items()
-    }
-    return save(tensors, {"info": json.dumps(asdict(checkpoint.info))})
-
-
-def _unpacked(payload: bytes) -> Checkpoint:
-    header = json.loads(payload[8 : 8 + int.from_bytes(payload[:8], "little")])
-    info = json.loads(header["__metadata__"]["info"])
-    info["world_offset"] = tuple(info["world_offset"])
-    return Checkpoint(CheckpointInfo(**info), load(payload))
+            if isinstance(command, Checkpoint):
+                trainer.restore(command)
+            elif command == STEP:
+                trainer.step()
+            else:
+                trainer.images.stop_prefetching()
+                return command

@@ -14,6 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from datetime import timedelta
 from types import TracebackType
+from typing import Any
 
 import torch
 from torch import Tensor, distributed
@@ -21,6 +22,7 @@ from torch.distributed.distributed_c10d import PrefixStore, Store
 from torch.distributed.rendezvous import rendezvous
 
 from dyngs.core.errors import DyngsError
+from dyngs.ops.device import CPU
 
 # Other ranks wait while rank 0 reads data, evaluates or runs pilot runs
 TIMEOUT = timedelta(days=30)
@@ -151,21 +153,22 @@ class Processes:
         """Return whether any process received a signal to stop."""
         return self._count(STOP) > 0
 
-    def broadcast_(self, values: Tensor) -> None:
-        """Replace the values of a tensor by those of rank 0."""
+    def broadcast(self, value: Any) -> Any:
+        """Return the picklable ``value`` of rank 0 in all processes."""
+        values = [value]
         if self.size > 1:
             with self._connected():
-                distributed.broadcast(values, 0)
+                distributed.broadcast_object_list(values, 0, device=CPU)
+        return values[0]
 
     def require_same(self, tensors: Mapping[str, Tensor], when: str) -> None:
         """Raise DyngsError unless the tensors have the same bytes in all processes."""
         if self.size == 1:
             return
-        own = torch.tensor([_checksum(tensors)], dtype=torch.int64, device="cpu")
-        sums = [torch.zeros_like(own) for _ in range(self.size)]
+        sums = [""] * self.size
         with self._connected():
-            distributed.all_gather(sums, own)
-        others = [rank for rank, x in enumerate(sums) if int(x) != int(sums[0])]
+            distributed.all_gather_object(sums, _checksum(tensors))
+        others = [rank for rank, x in enumerate(sums) if x != sums[0]]
         if others:
             raise DyngsError(
                 f"{when}: Gaussians of process {others[0]} differ from those of process 0; "
@@ -213,8 +216,8 @@ class Processes:
             return 0
 
 
-def _checksum(tensors: Mapping[str, Tensor]) -> int:
+def _checksum(tensors: Mapping[str, Tensor]) -> str:
     digest = hashlib.sha256()
     for _, x in sorted(tensors.items()):
         digest.update(x.detach().cpu().contiguous().numpy().tobytes())
-    return int.from_bytes(digest.digest()[:7], "big")
+    return digest.hexdigest()
