@@ -90,7 +90,6 @@ from dyngs.training.run_log import RunLog, read_recent_psnr
 from dyngs.training.trainer import Trainer
 
 PICTURES = "pictures"  # folder of the pictures of a person
-_COUNT = "budget.count"  # Name of the limit's state in a checkpoint
 # Largest part of the training time, and seconds, that the PSNR of test views may take
 _EVAL_FRACTION = 0.02
 _EVAL_SECONDS = 10.0
@@ -267,8 +266,6 @@ class _Run:
             if limits.gaussians is not None:
                 self._count = CountLimit(limits.gaussians, limits.seconds)
                 editors.append(self._count)
-                if resumed is not None:
-                    self._count.restore(resumed.part(_COUNT))
             if trainer.num_gaussians:
                 _show_memory(trainer, processes.local_size)
         self._leader = Leader(processes, config, _num_threads(config, processes))
@@ -363,9 +360,6 @@ class _Run:
     def _save(self) -> None:
         start = self.loop.stopwatch.seconds
         checkpoint = self.loop.trainer.checkpoint()
-        if self._count is not None:
-            kept = {f"{_COUNT}.{name}": x for name, x in self._count.state().items()}
-            checkpoint = replace(checkpoint, tensors=checkpoint.tensors | kept)
         if not self.folder.is_dir():  # removed, or renamed
             try:
                 self.folder.mkdir(parents=True)

@@ -6,11 +6,6 @@ are removed late in the run, with steps left for the others to adapt.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
-import torch
-from torch import Tensor
-
 from dyngs.compress.stage import importance_scores, mean_psnr, select_highest
 from dyngs.config import Config
 from dyngs.core.errors import format_count
@@ -24,8 +19,9 @@ class CountLimit:
     """Editor that limits the number of Gaussians to ``most``.
 
     Attributes:
-        before: number of Gaussians before the first removal; 0: none was needed.
-        lost: PSNR lost on training images by all removals, before fine-tuning, dB.
+        before: number of Gaussians before the first removal since the start or resume; 0: none was
+            needed.
+        lost: PSNR lost on training images by these removals, before fine-tuning, dB.
     """
 
     def __init__(self, most: int, seconds: float | None = None) -> None:
@@ -49,21 +45,6 @@ class CountLimit:
         name = _name(trainer.config, self.most)
         left = format_count(self.most, "Gaussian")
         return TrainingEdit(f"{name}: {count:,} -> {left}; {gain:+.2f} dB on training views", kept)
-
-    def state(self) -> dict[str, Tensor]:
-        """Return the state for a checkpoint; empty where nothing was removed."""
-        if not self.before:
-            return {}
-        return {
-            "before": torch.tensor(self.before, device="cpu"),
-            "lost": torch.tensor(self.lost, dtype=torch.float64, device="cpu"),
-        }
-
-    def restore(self, stored: Mapping[str, Tensor]) -> None:
-        """Restore the state that ``state`` returned."""
-        if stored:
-            self.before = int(stored["before"])
-            self.lost = float(stored["lost"])
 
     def reached(self, config: Config, count: int) -> str:
         """Return the message about the limit at the end of a run."""
