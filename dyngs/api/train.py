@@ -86,7 +86,7 @@ from dyngs.training.new_trainer import build_trainer
 from dyngs.training.plan import RunPlan
 from dyngs.training.prediction import network_trainer
 from dyngs.training.processes import Processes
-from dyngs.training.run_log import RunLog, read_recent_psnr
+from dyngs.training.run_log import RunLog
 from dyngs.training.trainer import Trainer
 
 PICTURES = "pictures"  # folder of the pictures of a person
@@ -277,7 +277,6 @@ class _Run:
             stages=[prune_stage] if isinstance(trainer, Trainer) else [],
             limits=editors,
             before_step=self._leader.before_step,
-            recent_psnr=read_recent_psnr(self.folder / LOG_NAME, trainer.done),
         )
         self._saved = trainer.done
         self._save_timer = SaveTimer(config.train.save_minutes, stopwatch.seconds)

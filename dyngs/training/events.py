@@ -55,16 +55,12 @@ class StepReport:
 
 
 class RecentMean:
-    """Mean of the last ``WINDOW`` finite values.
-
-    Args:
-        mean: mean of the ``count`` values before a run was resumed.
-    """
+    """Mean of the last ``WINDOW`` finite values."""
 
     WINDOW = 50
 
-    def __init__(self, mean: float = math.nan, count: int = 0) -> None:
-        self._values = deque([mean] * min(count, self.WINDOW), maxlen=self.WINDOW)
+    def __init__(self) -> None:
+        self._values = deque[float](maxlen=self.WINDOW)
 
     def add(self, value: float) -> None:
         if math.isfinite(value):

@@ -13,16 +13,13 @@ import numpy as np
 from dyngs.config import Config
 from dyngs.core.errors import DyngsError
 
-Scalars = Mapping[str, float]
-Images = Mapping[str, np.ndarray]
+Values = Mapping[str, float | np.ndarray]
 
 
 class Logger(Protocol):
     """A program that shows scalars, and images (H, W, 3) uint8, by names such as ``train/psnr``."""
 
-    def log_scalars(self, step: int, scalars: Scalars) -> None: ...
-
-    def log_images(self, step: int, images: Images) -> None: ...
+    def log(self, step: int, values: Values) -> None: ...
 
     def close(self) -> None: ...
 
@@ -33,13 +30,12 @@ class _TensorBoard:
         self._writer = board.SummaryWriter(str(folder / "tensorboard"), purge_step=after_step + 1)
         self.close = self._writer.close
 
-    def log_scalars(self, step: int, scalars: Scalars) -> None:
-        for name, value in scalars.items():
-            self._writer.add_scalar(name, value, step)
-
-    def log_images(self, step: int, images: Images) -> None:
-        for name, image in images.items():
-            self._writer.add_image(name, image, step, dataformats="HWC")
+    def log(self, step: int, values: Values) -> None:
+        for name, value in values.items():
+            if isinstance(value, np.ndarray):
+                self._writer.add_image(name, value, step, dataformats="HWC")
+            else:
+                self._writer.add_scalar(name, value, step)
 
 
 class _Wandb:
@@ -51,11 +47,10 @@ class _Wandb:
         )
         self.close = self._run.finish
 
-    def log_scalars(self, step: int, scalars: Scalars) -> None:
-        self._run.log(dict(scalars), step=step)
-
-    def log_images(self, step: int, images: Images) -> None:
-        self._run.log({name: self._wandb.Image(x) for name, x in images.items()}, step=step)
+    def log(self, step: int, values: Values) -> None:
+        image = self._wandb.Image
+        shown = {k: image(x) if isinstance(x, np.ndarray) else x for k, x in values.items()}
+        self._run.log(shown, step=step)
 
 
 class _Rerun:
@@ -65,15 +60,11 @@ class _Rerun:
         self._stream.save(folder / f"after_step_{after_step}.rrd")
         self.close = self._stream.flush
 
-    def log_scalars(self, step: int, scalars: Scalars) -> None:
+    def log(self, step: int, values: Values) -> None:
         self._stream.set_time("step", sequence=step)
-        for name, value in scalars.items():
-            self._stream.log(name, self._rerun.Scalars(value))
-
-    def log_images(self, step: int, images: Images) -> None:
-        self._stream.set_time("step", sequence=step)
-        for name, image in images.items():
-            self._stream.log(name, self._rerun.Image(image))
+        for name, value in values.items():
+            kind = self._rerun.Image if isinstance(value, np.ndarray) else self._rerun.Scalars
+            self._stream.log(name, kind(value))
 
 
 _LOGGERS = {"tensorboard": _TensorBoard, "wandb": _Wandb, "rerun": _Rerun}

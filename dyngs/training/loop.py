@@ -81,7 +81,6 @@ class Loop:
         stages: editors called before each step.
         limits: editors called after each step, before its ``StepDone`` event.
         before_step: called with the trainer before each step.
-        recent_psnr: mean PSNR of the last steps before the run was resumed.
     """
 
     def __init__(
@@ -94,7 +93,6 @@ class Loop:
         stages: Sequence[Editor] = (),
         limits: Sequence[Editor] = (),
         before_step: Callable[[Trainable], None] = lambda _: None,
-        recent_psnr: RecentMean | None = None,
     ) -> None:
         self.trainer = trainer
         self.total = total
@@ -103,7 +101,7 @@ class Loop:
         self._stages = stages
         self._limits = limits
         self._before_step = before_step
-        self.recent_psnr = recent_psnr or RecentMean()
+        self.recent_psnr = RecentMean()
         self._listeners: list[Listener] = []
         self._is_stopped: Callable[[], bool] = lambda: False
 

@@ -5,39 +5,16 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import IO, Any
 
 from dyngs.io.fields import read_limited
 from dyngs.io.write import write_image, write_text
-from dyngs.training.events import Evaluated, Event, ProgressImage, RecentMean, StepDone
+from dyngs.training.events import Evaluated, Event, ProgressImage, StepDone
 from dyngs.training.loggers import Logger
 
 MAX_LOG_BYTES = 1 << 28  # a line has about 150 bytes
-
-
-@dataclass(frozen=True)
-class LogRecord:
-    """One line of ``log.jsonl``.
-
-    Attributes:
-        loss, psnr: of this step and its image, in dB. None if the mask excludes all pixels.
-        mean_psnr: mean over the images of the last steps, in dB.
-        num_gaussians: after the step.
-        num_moving: Gaussians that depend on time, after the step.
-        bad_gradients: parameter rows skipped so far because their gradient was not finite.
-        seconds: training time so far, over all resumes.
-    """
-
-    step: int
-    loss: float
-    psnr: float | None
-    mean_psnr: float | None
-    num_gaussians: int
-    num_moving: int
-    bad_gradients: int
-    seconds: float
 
 
 class RunLog:
@@ -62,7 +39,7 @@ class RunLog:
         """Log scores of ``StepDone`` and ``Evaluated``; write progress images to ``progress/``."""
         match event:
             case StepDone() if event.step % self._every == 0 or event.is_last:
-                self._append("train", asdict(log_record(event)) | event.report.scores)
+                self._append("train", _record(event))
             case Evaluated():
                 scores = asdict(event)
                 del scores["seconds"]
@@ -70,7 +47,7 @@ class RunLog:
             case ProgressImage(step, split, pixels):
                 write_image(self.path.parent / "progress" / f"step_{step:07d}.png", pixels)
                 for logger in self._loggers:
-                    logger.log_images(step, {f"{split}/image": pixels})
+                    logger.log(step, {f"{split}/image": pixels})
 
     def _append(self, group: str, values: dict[str, Any]) -> None:
         """Append a line and flush, so that a crash loses nothing."""
@@ -79,7 +56,7 @@ class RunLog:
         step = values.pop("step")
         scalars = {f"{group}/{k}": x for k, x in values.items() if isinstance(x, int | float)}
         for logger in self._loggers:
-            logger.log_scalars(step, scalars)
+            logger.log(step, scalars)
 
     def __enter__(self) -> RunLog:
         return self
@@ -90,27 +67,25 @@ class RunLog:
             logger.close()
 
 
-def log_record(event: StepDone) -> LogRecord:
+def _record(event: StepDone) -> dict[str, Any]:
+    """Return one line of ``log.jsonl``.
+
+    ``loss`` and ``psnr`` are of this step and its image, in dB, and None if the mask excludes all
+    pixels. ``mean_psnr`` is over the images of the last steps. ``bad_gradients`` counts parameter
+    rows skipped until now because their gradient was not finite. ``seconds`` are over all resumes.
+    """
     quality = event.report.psnr
-    return LogRecord(
-        step=event.step,
-        loss=event.report.loss,
-        psnr=quality if math.isfinite(quality) else None,
-        mean_psnr=event.mean_psnr,
-        num_gaussians=event.num_gaussians,
-        num_moving=event.num_moving,
-        bad_gradients=event.bad_gradients,
-        seconds=round(event.seconds, 3),
-    )
-
-
-def read_recent_psnr(path: Path, step: int) -> RecentMean:
-    """Return the mean PSNR that a log holds for ``step`` or the last step before it."""
-    for line in reversed(_lines_up_to(path, step)):
-        mean = json.loads(line).get("mean_psnr")
-        if isinstance(mean, float):
-            return RecentMean(mean, step)
-    return RecentMean()
+    return {
+        "step": event.step,
+        "loss": event.report.loss,
+        "psnr": quality if math.isfinite(quality) else None,
+        "mean_psnr": event.mean_psnr,
+        "num_gaussians": event.num_gaussians,
+        "num_moving": event.num_moving,
+        "bad_gradients": event.bad_gradients,
+        "seconds": round(event.seconds, 3),
+        **event.report.scores,
+    }
 
 
 def _lines_up_to(path: Path, step: int) -> list[str]:
