@@ -25,10 +25,10 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import torch
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor
 
-from dyngs.core.errors import DyngsError, format_one_line, require_regular_file
+from dyngs.core.errors import DyngsError, describe_error, require_regular_file
 from dyngs.core.gaussians import storage_order
 from dyngs.core.state import strip_roles
 from dyngs.gaussians import Gaussians, TopologyEdit
@@ -36,7 +36,7 @@ from dyngs.gaussians.scene import GaussianScene, require_gaussians
 from dyngs.io.write import atomic_file
 from dyngs.models.checkpoint import Checkpoint, CheckpointInfo, parse_info
 from dyngs.models.renderable import Renderable
-from dyngs.ops.quaternions import quat_product
+from dyngs.ops.quaternions import quat_product, unit_quats
 
 LIMIT = 2**20  # bound on the magnitude of the integers; larger values are stored as float32
 SMALLEST_STEP, LARGEST_STEP = 2.0**-100, 2.0**60
@@ -142,9 +142,7 @@ def sort_axes(quats: np.ndarray, log_scales: np.ndarray) -> tuple[np.ndarray, np
 
 def _unit(quats: np.ndarray) -> np.ndarray:
     """Return (N, 4) float64 of unit length; zero becomes the identity."""
-    wide = quats.astype(np.float64)
-    length = np.sqrt(np.square(wide).sum(1, keepdims=True))
-    return np.where(length > 0, wide / np.where(length > 0, length, 1), [1.0, 0.0, 0.0, 0.0])
+    return unit_quats(torch.from_numpy(quats).double()).numpy()
 
 
 def _product(left: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -589,14 +587,8 @@ def decode_scene(data: bytes) -> Checkpoint:
         if any(body[end:]) or end > len(body):
             raise DyngsError("its data does not match its header")
         return Checkpoint(parse_info(header.info), to_checkpoint_tensors(tensors))
-    except KeyError as missing:
-        raise DyngsError(f"{format_one_line(str(missing), 60)} is missing") from None
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise DyngsError(f"its header is wrong at {where or 'its start'}: {first['msg']}") from None
-    except (ValueError, TypeError, OverflowError, RuntimeError, IndexError) as error:
-        raise DyngsError(f"its contents are wrong: {str(error).splitlines()[0]}") from None
+    except (ValueError, KeyError, TypeError, OverflowError, RuntimeError, IndexError) as error:
+        raise DyngsError(f"its contents are wrong: {describe_error(error)}") from None
 
 
 def _tensor(entry: _Entry, block: bytes, coarseness: Tensor | None) -> Tensor:
