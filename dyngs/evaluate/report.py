@@ -110,12 +110,11 @@ def score_fitted_poses(
             )
         return fields | {"psnr_own_poses": fields["own_poses"].psnr}
     scene = require_gaussians(drawing.scene, "what cameras are fitted to")
-    options = scene.options
     scores: list[float] = []
     for image in (images[i] for i in range(len(images))):
-        cameras = fit_camera_to_image(scene, image, background, size, options=options).cameras
+        cameras = fit_camera_to_image(scene, image, background, size)
         with torch.no_grad():
-            rendering = scene.render(cameras, image.time, options=options, background=background)
+            rendering = scene.render(cameras, image.time, background=background)
         scores.append(psnr(rendering.rgb[0], image.composite(background), image.mask))
     return {"psnr_own_poses": fmean(scores)}
 

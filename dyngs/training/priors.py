@@ -22,6 +22,7 @@ from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.models.model import Loss, LossInput
 from dyngs.models.views import training_cameras
+from dyngs.training.corrections.cells import project_points
 
 SOFT_PX = 0.5  # Constant of the Charbonnier loss, px: smaller errors are penalised quadratically
 SOLID = 0.5  # Rendered alpha above which depth and displacement are compared
@@ -248,7 +249,8 @@ def render_displacements(
     Returns:
         (H, W, 3): displacement x and y in px, and the sum of blending weights.
     """
-    (from_px, from_z), (to_px, to_z) = _projected(start.means, here), _projected(end.means, there)
+    from_px, from_z = project_points(here, start.means)
+    to_px, to_z = project_points(there, end.means)
     seen = ((from_z > options.near) & (to_z > options.near))[:, None]
     limit = float(here.width + here.height)
     moved = torch.where(seen, to_px - from_px, 0.0).clamp(-limit, limit)
@@ -256,14 +258,6 @@ def render_displacements(
     drawn = render(start.detach(), here, options, shader=lambda *_: carried).rgb[0]
     total = drawn[..., 2:]
     return torch.cat([drawn[..., :2] / total.detach().clamp_min(0.1), total], dim=-1)
-
-
-def _projected(means: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
-    pose = cameras.cam_from_world[0]
-    k = cameras.intrinsics[0]
-    local = means @ pose[:3, :3].T + pose[:3, 3]
-    depth = local[:, 2]
-    return local[:, :2] / depth.clamp_min(1e-6)[:, None] * k.diagonal()[:2] + k[:2, 2], depth
 
 
 def motion_error(drawn: Tensor, wanted: Tensor, size: int) -> Tensor | None:

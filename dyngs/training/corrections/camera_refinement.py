@@ -22,7 +22,6 @@ from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.capture import View
 from dyngs.data.loader import Image
 from dyngs.gaussians.optimizer import AdamState
-from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.models.model import Correction
 from dyngs.ops.adam import Count, adam_step_
@@ -153,18 +152,13 @@ def common_motion_basis(views: Sequence[View], size: float) -> Tensor:
     centers = (centers - centers.mean(0)) / size
     columns = np.zeros((len(views), 6, 7))
     columns[:, :3, :3] = -rotations
-    columns[:, 3:, :3] = rotations @ _cross_matrices(centers)
+    # Row j of the cross products is the column j of the cross-product matrix.
+    crosses = np.cross(centers[:, None], np.eye(3))
+    columns[:, 3:, :3] = rotations @ crosses.swapaxes(1, 2)
     columns[:, 3:, 3:6] = -rotations
     columns[:, 3:, 6] = -np.einsum("vij,vj->vi", rotations, centers)
     basis, values, _ = np.linalg.svd(columns.reshape(-1, 7), full_matrices=False)
     return torch.as_tensor(basis[:, values > 1e-9 * values[0]], dtype=torch.float32, device="cpu")
-
-
-def _cross_matrices(vectors: np.ndarray) -> np.ndarray:
-    """Return the cross-product matrices (V, 3, 3) of ``vectors`` (V, 3)."""
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
 
 
 def _pose_key(view: View) -> Hashable:
@@ -258,28 +252,17 @@ FIT_SSIM_WEIGHT = 0.2
 
 
 def fit_camera_to_image(
-    scene: GaussianScene,
-    image: Image,
-    background: Tensor,
-    size: float,
-    *,
-    options: RenderOptions | None = None,
-    weights: Tensor | None = None,
-) -> Image:
-    """Return ``image`` with its camera pose fitted to the scene (iNeRF, Yen-Chen et al. 2021).
+    scene: GaussianScene, image: Image, background: Tensor, size: float
+) -> Cameras:
+    """Return the camera of ``image`` with its pose fitted to the scene (iNeRF, Yen-Chen et al.
+    2021).
 
     The intrinsics stay fixed.
 
     Args:
         size: extent of the scene in world units.
-        options: render options. None uses those of the scene.
-        weights: (H, W) weights of pixels, in addition to the mask.
     """
-    options = options or scene.options
     truth = image.composite(background)
-    counts = image.mask if weights is None else weights
-    if weights is not None and image.mask is not None:
-        counts = weights * image.mask
     correction = torch.zeros(1, 6, device=image.cameras.cam_from_world.device)
     first = torch.zeros_like(correction)
     second = torch.zeros_like(correction)
@@ -288,8 +271,8 @@ def fit_camera_to_image(
     for update in range(1, FIT_UPDATES + 1):
         camera = with_camera_gradients(apply_correction(image.cameras, correction[0], None, size))
         with torch.enable_grad():
-            drawn = scene.render(camera, image.time, options=options, background=background)
-            loss = l1_ssim_loss(drawn.rgb[0], truth, FIT_SSIM_WEIGHT, counts)
+            drawn = scene.render(camera, image.time, background=background)
+            loss = l1_ssim_loss(drawn.rgb[0], truth, FIT_SSIM_WEIGHT, image.mask)
             leaves = [camera.cam_from_world, camera.intrinsics]
             by_pose, by_intrinsics = torch.autograd.grad(loss, leaves)
         if float(loss.detach()) < least:
@@ -298,4 +281,4 @@ def fit_camera_to_image(
         rate = FIRST_FIT_RATE * (LAST_FIT_RATE / FIRST_FIT_RATE) ** (update / FIT_UPDATES)
         slope = correction_gradients(camera, by_pose, by_intrinsics, size)[0][None]
         adam_step_(correction, slope, first, second, lr=rate, step=update)
-    return replace(image, cameras=apply_correction(image.cameras, best[0], None, size))
+    return apply_correction(image.cameras, best[0], None, size)

@@ -37,16 +37,21 @@ def unproject_pixels(camera: Cameras, which: Tensor, depth: Tensor) -> Tensor:
     return (rays * depth[:, None] - pose[:3, 3]) @ pose[:3, :3]
 
 
+def project_points(camera: Cameras, world: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the image coordinates (P, 2), px, of world points (P, 3), and their depths (P,)."""
+    pose = camera.cam_from_world[0]
+    k = camera.intrinsics[0]
+    local = world @ pose[:3, :3].T + pose[:3, 3]
+    depth = local[:, 2]
+    return local[:, :2] / depth.clamp_min(_TINY)[:, None] * k.diagonal()[:2] + k[:2, 2], depth
+
+
 def project_to_pixels(camera: Cameras, world: Tensor) -> tuple[Tensor, Tensor]:
     """Return the flat pixel indices (P,) of world points (P, 3), and their depths (P,).
 
     The index is -1 outside the image and behind the camera.
     """
-    pose = camera.cam_from_world[0]
-    k = camera.intrinsics[0]
-    local = world @ pose[:3, :3].T + pose[:3, 3]
-    z = local[:, 2]
-    at = local[:, :2] / z.clamp_min(_TINY)[:, None] * k.diagonal()[:2] + k[:2, 2]
+    at, z = project_points(camera, world)
     inside = (
         (z > _TINY) & (at >= 0).all(1) & (at < at.new_tensor([camera.width, camera.height])).all(1)
     )

@@ -244,10 +244,11 @@ def shown(scene: StaticScene, image: Image) -> Tensor:
 def test_the_pose_of_a_render_is_found_again(left_only: bool) -> None:
     scene, right = scene_and_image()
     wrong = replace(right, cameras=apply_correction(right.cameras, WRONG, None, 3.0))
-    weights = torch.zeros(40, 48) if left_only else None
-    if weights is not None:
-        weights[:, :24] = 1
-    found = fit_camera_to_image(scene, wrong, BLACK, 3.0, weights=weights)
+    if left_only:
+        mask = torch.zeros(40, 48)
+        mask[:, :24] = 1
+        wrong = replace(wrong, mask=mask)
+    found = replace(right, cameras=fit_camera_to_image(scene, wrong, BLACK, 3.0))
     before, after = (psnr(shown(scene, x), right.rgb_premultiplied) for x in (wrong, found))
     assert after > before + 10
     assert torch.equal(found.cameras.intrinsics, right.cameras.intrinsics)
