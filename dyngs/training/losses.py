@@ -1,4 +1,5 @@
-"""Loss terms of a training image: colours, silhouette, regularizers; and their finiteness check."""
+"""Loss terms of a training image: colours, silhouette, losses of the user; and their finiteness
+check."""
 
 from __future__ import annotations
 
@@ -49,20 +50,6 @@ class SilhouetteLoss(Loss):
             error = error * look.image.mask
         fraction = self.early if look.step < self._full_from else 1.0
         return {"alpha": fraction * self.weight * error.mean()}
-
-
-class PenaltyLoss(Loss):
-    """Regularizers of the rendered Gaussians."""
-
-    def __call__(self, look: LossInput) -> Mapping[str, Tensor]:
-        return look.drawn.penalties
-
-
-class RegularizerLoss(Loss):
-    """Regularizers of the model parameters."""
-
-    def __call__(self, look: LossInput) -> Mapping[str, Tensor]:
-        return look.model.regularizers()
 
 
 LossFunction = Callable[[LossInput], Tensor]

@@ -32,7 +32,7 @@ from dyngs.ops.device import select_device
 from dyngs.training.corrections.camera_refinement import CameraRefinement
 from dyngs.training.corrections.exposure import ViewExposures
 from dyngs.training.corrections.robust import RobustMasks
-from dyngs.training.losses import ImageLoss, PenaltyLoss, RegularizerLoss, SilhouetteLoss
+from dyngs.training.losses import ImageLoss, SilhouetteLoss
 from dyngs.training.priors import PriorLosses, load_priors
 from dyngs.training.trainer import Trainer, TrainerParts
 
@@ -123,10 +123,8 @@ def build_trainer(
         losses = [
             model.colour_loss or ImageLoss(config.train.ssim_weight),
             SilhouetteLoss(config.train.alpha_weight, early, FULL_OPACITY_FROM * steps),
-            PenaltyLoss(),
             *([] if exposures is None else [exposures]),
             priors,
-            RegularizerLoss(),
             *added_losses,
         ]
         found = (robust, exposures, refinement)

@@ -219,6 +219,9 @@ class Trainer(Generic[M]):
         terms: dict[str, Tensor] = {}
         for loss in self.losses:
             terms |= loss(look)
+        # Regularizers of the rendered Gaussians, and of the model parameters.
+        terms |= drawn.penalties
+        terms |= self.model.regularizers()
         check = StepCheck(terms, drawn.moved, self.device)
         with torch.autograd.set_multithreading_enabled(False):
             # Run GPU nodes in this thread, too, to avoid switching threads.

@@ -103,10 +103,7 @@ class ViewExposures(Loss, Correction):
         return replace(view, rendered=torch.where(white, shown.clamp_max(1.0), shown))
 
     def __call__(self, look: LossInput) -> dict[str, Tensor]:
-        return self.penalties(look.index)
-
-    def penalties(self, index: int) -> dict[str, Tensor]:
-        return {"exposure": (self._weights * self._values[index].square()).mean()}
+        return {"exposure": (self._weights * self._values[look.index].square()).mean()}
 
     def after_backward(self, index: int, step: int, image: Image) -> Count:
         if step <= self._begins:
