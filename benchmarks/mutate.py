@@ -28,7 +28,7 @@ SECONDS = 240
 
 # file, what is there once, what is put in its place, tests
 MUTATIONS = (
-    ("api/choose.py", "gains = [after - before", "gains = [before - after", "api/test_choose.py"),
+    ("api/choose.py", "gains = [now - then", "gains = [then - now", "api/test_choose.py"),
     ("api/choose.py", "moving if choice.taken else as_static(config)", "as_static(config) if choice.taken else moving", "api/test_choose.py"),
     ("api/choose.py", '[_with(small, "model", motion_from=1.0), small]', '[small, _with(small, "model", motion_from=1.0)]', "api/test_choose.py"),
     ("api/choose.py", "if moves is False:", "if moves is True:", "api/test_choose.py test_quality.py"),

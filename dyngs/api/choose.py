@@ -43,8 +43,6 @@ from dyngs.runs.folder import CHOICES_NAME
 from dyngs.training.loop import Interrupts
 from dyngs.training.new_trainer import GaussianTrainer, add_initial_points, build_trainer
 
-Pair = tuple[GaussianTrainer, GaussianTrainer]
-
 
 @dataclass(frozen=True)
 class _Size:
@@ -125,11 +123,10 @@ class Choice:
 
 def resolve_by_pilot_runs(
     config: Config, capture: Capture, on_progress: ProgressCallback = ignore_progress
-) -> tuple[Config, list[Choice], Capture]:
+) -> tuple[Config, Choice | None]:
     """Resolve motion by pilot runs, where it was not requested.
 
-    Returns the resolved config, the results, and the capture with the points that the scene begins
-    with.
+    Returns the resolved config, and the result where there were pilot runs.
 
     Raises:
         DyngsError: images that cannot be read, or a capture that this kind of model cannot be
@@ -141,10 +138,10 @@ def resolve_by_pilot_runs(
         raise DyngsError(f"{config.data.root}: {problem}")
     model: Any = config.model
     if capability(model, HasMotion) is None or not model.pilot_runs:
-        return config, [], add_initial_points(capture, config, on_progress=on_progress)
+        return config, None
     moves = _motion_of_fixed_cameras(capture, config)
     if moves is False:
-        return _as_static(config, capture, on_progress)
+        return as_static(config), None
     moving = _with(config, "model", pilot_runs=False)
     views = capture.splits["train"]
     at_once = len(views) / len({view.time for view in views})
@@ -153,29 +150,19 @@ def resolve_by_pilot_runs(
     masks = MotionMasks(capture, config.data) if moves else None
     if moves is None and not _finds_motion(moving, capture, on_progress):
         log_info("nothing moves: a static model explains all images, trained as a static scene")
-        return _as_static(config, capture, on_progress)
+        return as_static(config), None
     choice = _motion(moving, capture, on_progress, masks)
     if choice is None:
         log_info(f"model.kind=dynamic {_TOO_SHORT}; model.pilot_runs=false trains a moving scene")
-        return _as_static(config, capture, on_progress)
+        return as_static(config), None
     log_info(f"  {choice}")
-    best = moving if choice.taken else as_static(config)
-    return best, [choice], add_initial_points(capture, best, on_progress=on_progress)
+    return moving if choice.taken else as_static(config), choice
 
 
-def _as_static(
-    config: Config, capture: Capture, on_progress: ProgressCallback
-) -> tuple[Config, list[Choice], Capture]:
-    """Return the config of a static scene, no results, and the prepared capture."""
-    static = as_static(config)
-    return static, [], add_initial_points(capture, static, on_progress=on_progress)
-
-
-def write_choices(folder: Path, choices: Sequence[Choice]) -> None:
-    """Write the results of pilot runs into a run folder; nothing where there were none."""
-    if choices:
-        text = json.dumps([asdict(choice) for choice in choices], indent=2)
-        write_text(folder / CHOICES_NAME, text + "\n")
+def write_choice(folder: Path, choice: Choice | None) -> None:
+    """Write the result of pilot runs into a run folder; nothing where there was none."""
+    if choice is not None:
+        write_text(folder / CHOICES_NAME, json.dumps([asdict(choice)], indent=2) + "\n")
 
 
 def as_static(config: Config) -> Config:
@@ -302,7 +289,8 @@ def _compared(
     """Train both configs, without and with motion, without each fold of the training views, and
     compare them on it; None where that takes until ``deadline``."""
     begun = time.monotonic()
-    pairs = list[list[float]]()
+    before = list[float]()
+    after = list[float]()
     steps = both[0].train.steps - 1
     done = 0
 
@@ -315,14 +303,16 @@ def _compared(
         one, other = (_trained(config, capture, held_out, deadline, on_step) for config in both)
         if one is None or other is None:
             return None
-        pairs += [view_psnr((one, other), index, masks) for index in sorted(held_out)]
-    gains = [after - before for before, after in pairs]
+        for index in sorted(held_out):
+            before.append(view_psnr(one, index, masks))
+            after.append(view_psnr(other, index, masks))
+    gains = [now - then for then, now in zip(before, after, strict=True)]
     gain = fmean(gains)
     error = (stdev(gains) if len(gains) > 1 else math.inf) / math.sqrt(len(gains))
     return Choice(
         setting="model.kind=dynamic",
-        views=len(pairs),
-        without=fmean(before for before, _ in pairs),
+        views=len(gains),
+        without=fmean(before),
         gain=gain,
         error=error,
         steps=both[0].train.steps,
@@ -428,34 +418,29 @@ def _motion_of_fixed_cameras(capture: Capture, config: Config) -> bool | None:
 
 
 @torch.no_grad()
-def view_psnr(pair: Pair, index: int, masks: MotionMasks | None = None) -> list[float]:
-    """Return the PSNR, dB, of a training view by two models that were not trained on it.
+def view_psnr(trainer: GaussianTrainer, index: int, masks: MotionMasks | None = None) -> float:
+    """Return the PSNR, dB, of a training view by a model that was not trained on it.
 
-    Where either has exposures, after an affine colour that is fitted to the view.
+    With exposures, after an affine colour that is fitted to the view.
 
     Args:
         masks: score moving pixels only, in views with enough of them.
     """
-    image = pair[0].images[index]
-    background = background_colour(pair[0].background)
+    image = trainer.images[index]
+    model = trainer.model
+    background = background_colour(trainer.background)
     truth = image.composite(background)
     weights = image.mask
     if masks is not None:
         size = (image.cameras.width, image.cameras.height)
-        moving = masks.mask(pair[0].images.views[index], *size)
+        moving = masks.mask(trainer.images.views[index], *size)
         if moving is not None and int(moving.sum()) >= FEWEST_PIXELS:
             weights = moving.to(truth.device).float() * (1 if weights is None else weights)
-    has_exposures = any(trainer.config.train.exposure == "always" for trainer in pair)
-    scores = []
-    for trainer in pair:
-        model = trainer.model
-        own = background_colour(trainer.background)
-        rendering = model.scene.render(
-            image.cameras, image.time, options=model.options, background=own
-        )
-        rgb = rendering.rgb[0]
-        if has_exposures:
-            affine = fit_affine_colour([(image, rendering)], background)
-            rgb = apply_affine_colour(affine, image, rendering, background)
-        scores.append(psnr(rgb, truth, weights))
-    return scores
+    rendering = model.scene.render(
+        image.cameras, image.time, options=model.options, background=background
+    )
+    rgb = rendering.rgb[0]
+    if trainer.config.train.exposure == "always":
+        affine = fit_affine_colour([(image, rendering)], background)
+        rgb = apply_affine_colour(affine, image, rendering, background)
+    return psnr(rgb, truth, weights)

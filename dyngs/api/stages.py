@@ -26,6 +26,7 @@ from dyngs.runs.capture_record import require_same_capture
 from dyngs.runs.checkpoint import SCENE_FILE, seconds_at
 from dyngs.runs.folder import EXPORT_FOLDER, write_requested_config
 from dyngs.training.limits import apply_gaussian_cap, apply_pixel_cap, gaussian_limit
+from dyngs.training.new_trainer import add_initial_points
 from dyngs.training.plan import (
     Limits,
     RunPlan,
@@ -117,9 +118,10 @@ def run_pilots(plan: RunPlan, report: ProgressCallback) -> RunPlan:
     message = describe_shrinking(capture.splits, config.data)
     if message and "longest_side" not in config.data.model_fields_set:
         log_info(message)
-    config, choices, capture = resolve_by_pilot_runs(config, capture, report)
+    config, choice = resolve_by_pilot_runs(config, capture, report)
+    capture = add_initial_points(capture, config, on_progress=report)
     config = apply_pixel_cap(config, capture)
-    return replace(plan, resolved=config, capture=capture, choices=tuple(choices))
+    return replace(plan, resolved=config, capture=capture, choice=choice)
 
 
 def find_first_gaussians(plan: RunPlan) -> RunPlan:

@@ -14,7 +14,7 @@ import torch
 from dyngs.api.budget.count import CountLimit
 from dyngs.api.budget.size import has_file, write_limited_file
 from dyngs.api.budget.time import TimeLimit, fit_minutes
-from dyngs.api.choose import write_choices
+from dyngs.api.choose import write_choice
 from dyngs.api.following import Leader
 from dyngs.api.run_choice import choose_run
 from dyngs.api.stages import (
@@ -287,7 +287,7 @@ class _Run:
             write_new_config(self.folder, config)
             write_requested_config(self.folder, plan.requested)
             write_record(self.folder, config.data, plan.capture)
-            write_choices(self.folder, plan.choices)
+            write_choice(self.folder, plan.choice)
 
     @property
     def config(self) -> Config:

@@ -40,7 +40,7 @@ class RunPlan:
         uncapped: resolved config without the limit on Gaussians, used for initialisation.
         capture: None for a network, which has several, and until it is read.
         first: Gaussians of another scene to start from.
-        choices: results of pilot runs.
+        choice: result of pilot runs.
         losses: of the user, in addition to those of the config.
         is_extended: whether a finished or interrupted run is extended.
     """
@@ -51,7 +51,7 @@ class RunPlan:
     capture: Capture | None = None
     first: InitialGaussians | None = None
     limits: Limits = Limits()
-    choices: tuple[Any, ...] = ()
+    choice: Any = None
     losses: tuple[AddedLoss, ...] = ()
     is_extended: bool = False
 

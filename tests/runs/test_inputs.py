@@ -50,7 +50,7 @@ VALUES = (
 )
 OWN = "in a run folder, or in a hidden folder, that its caller has made and checked"
 UNCHECKED = {
-    "api/choose.py:write_choices": OWN,
+    "api/choose.py:write_choice": OWN,
     "bench.py:write_report": VALUES,
     "budget/size.py:write_within": OWN,
     "camera_paths/path.py:write_path": VALUES,
