@@ -101,7 +101,9 @@ def train(
     resume_from: Path | None = None,
     listeners: Sequence[Listener] = (),
     processes: Processes | None = None,
-    progress: Callable[[], AbstractContextManager[ProgressCallback]] | None = None,
+    progress: Callable[[], AbstractContextManager[ProgressCallback]] = lambda: nullcontext(
+        ignore_progress
+    ),
     capture: Capture | None = None,
     losses: Sequence[AddedLoss] = (),
 ) -> Path:
@@ -127,7 +129,7 @@ def train(
             never stopped.
         listeners: are told everything that happens, see ``dyngs.training.events``.
         processes: that this one, the first of them, leads; None: it is alone.
-        progress: shows how far what comes before training is; None: nothing does.
+        progress: shows how far what comes before training is.
         capture: trained on instead of what ``config.data`` reads.
         losses: added to those of dyngs, named in ``config.train.losses``.
 
@@ -150,7 +152,7 @@ def train(
     if resume_from is None:
         if not (folder / RESOLVED_NAME).is_file():
             collect_inputs(config).require_output(folder)
-        with progress() if progress else nullcontext(ignore_progress) as report:
+        with progress() as report:
             plan = continue_scene(find_poses(plan, report))
         if config.run.dir is None:
             folder, continued = choose_run(folder, plan.resolved, continues=capture is None)
@@ -166,24 +168,23 @@ def train(
         resumed = None
         if resume_from is None:
             plan = replace(plan, requested=plan.resolved)
-            if is_finished(folder, plan.resolved) and not _is_export_pending(plan.resolved, folder):
-                log_info(_about_finished(plan.resolved, folder))
-                return folder
-            require_startable(folder, plan.resolved)
+            is_done = is_finished(folder, plan.resolved)
         else:
             update_data_root(folder, plan.resolved.data)
             resumed = _newest(folder)
             plan = replace(plan, requested=load_requested_config(folder))
             plan = extend_run(plan, folder, resumed)
-        if resumed is not None:
-            total = plan.resolved.total_steps
-            if resumed.info.step >= total and not _is_export_pending(plan.resolved, folder):
-                log_info(_about_finished(plan.resolved, folder))
-                return folder
+            is_done = resumed is not None and resumed.info.step >= plan.resolved.total_steps
+        has_export = plan.resolved.budget.max_mb is None or has_file(folder)
+        if is_done and has_export:
+            log_info(_about_finished(plan.resolved, folder))
+            return folder
+        if resume_from is None:
+            require_startable(folder, plan.resolved)
         stopwatch = Stopwatch()
         images = None
         if resumed is None:
-            with progress() if progress else nullcontext(ignore_progress) as report:
+            with progress() as report:
                 plan = run_pilots(plan, report)
             plan = set_limits(find_first_gaussians(plan))
             if plan.limits.seconds is not None:
@@ -434,10 +435,6 @@ def _show_memory(trainer: Trainer[Any], processes: int) -> None:
         warning = forecast.warning()
         if warning is not None:
             log_warning(warning)
-
-
-def _is_export_pending(config: Config, folder: Path) -> bool:
-    return config.budget.max_mb is not None and not has_file(folder)
 
 
 def _newest(folder: Path) -> Checkpoint | None:
