@@ -334,9 +334,8 @@ def _trained(
 
     By default the last step is left out: in it, a model at rest would begin to move.
     """
-    trainer = build_trainer(
-        config, capture, held_out=held_out, first=load_initial_gaussians(config, capture)
-    )
+    trainer = build_trainer(config, capture, first=load_initial_gaussians(config, capture))
+    trainer.hold_out(held_out)
     last = config.train.steps - 1 if last is None else last
     with Interrupts() as interrupts:
         while trainer.done < last and time.monotonic() < deadline:

@@ -54,7 +54,6 @@ def build_trainer(
     *,
     restored: bool = False,
     images: ImageLoader | None = None,
-    held_out: frozenset[int] = frozenset(),
     first: InitialGaussians | None = None,
     uncapped: Config | None = None,
     added_losses: Sequence[Loss] = (),
@@ -65,7 +64,6 @@ def build_trainer(
         capture: as returned by ``prepare_capture``. None reads it.
         restored: a checkpoint will be restored, so initial points are not needed.
         images: training images of another trainer of the same capture. None opens them.
-        held_out: indices of training views that are never trained on.
         first: Gaussians to start from. None initialises them as in ``config.init``.
         uncapped: config without the limit on Gaussians, used for initialisation. None uses
             ``config``.
@@ -90,14 +88,6 @@ def build_trainer(
         images = images.without_motion_masks()
     background = resolve_background(config, capture)
     extent = scene_geometry(capture).extent
-    messages = [priors.message] if priors.message else []
-    published = capture.has_alpha and config.train.alpha_weight == 0 and background != "random"
-    if published and not restored:
-        messages.append(
-            f"train.alpha_weight=0: images are compared on {background} only, so {background} "
-            "surfaces may "
-            "become transparent"
-        )
     early = _early_alpha_fraction(config, capture, images, background)
 
     def parts(config: Config) -> TrainerParts:
@@ -138,8 +128,7 @@ def build_trainer(
         background=background,
         extent=extent,
         generator=generator,
-        pending_messages=messages,
-        held_out=held_out,
+        start_message=priors.message,
         device=select_device(config.run.device),
     )
 

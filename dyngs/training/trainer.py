@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial, reduce
 from itertools import islice
@@ -113,7 +112,7 @@ class Trainer(Generic[M]):
         build_parts: creates model, losses and corrections for the schedules of a config.
         background: "white", "black" or "random" (a new colour per step, behind rendering and
             image).
-        pending_messages: lines that are logged with the next step.
+        start_message: lines that are logged with the first step.
         bad_gradients: number of parameter rows skipped because their gradient was not finite.
         held_out: indices of training views that are not trained on.
         processes: the processes that share the views of each step.
@@ -127,10 +126,10 @@ class Trainer(Generic[M]):
     background: str
     extent: float
     generator: torch.Generator
-    pending_messages: list[str] = field(default_factory=list)
-    held_out: frozenset[int] = frozenset()
+    start_message: str = ""
     device: torch.device = CPU
     processes: Processes = field(default_factory=Processes)
+    held_out: frozenset[int] = field(default=frozenset(), init=False)
     done: int = field(default=0, init=False)
     bad_gradients: Count = field(default=0, init=False)
     sampler: ViewSampler = field(init=False)
@@ -165,17 +164,20 @@ class Trainer(Generic[M]):
         step = self.done + 1
         reports = []
         for index, seed in self._next_views(step):
-            with _random_numbers(self.generator, seed):
-                reports.append(self._backward(step, index))
+            state = self.generator.get_state()
+            if seed is not None:
+                self.generator.manual_seed(seed)
+            reports.append(self._backward(step, index))
+            if seed is not None:
+                self.generator.set_state(state)
         loss = self._average_gradients(step, [report.loss for report in reports])
         updated = self.model.update(step)
         self.bad_gradients = self.bad_gradients + updated.bad
         self.done = step
         if updated.topology_changed:
             self.processes.require_same(strip_roles(self.model.scene.state()), f"after step {step}")
-        messages = [*self.pending_messages, updated.finding or ""]
-        self.pending_messages.clear()
-        message = "\n".join(line for line in messages if line)
+        message = "\n".join(filter(None, [self.start_message, updated.finding]))
+        self.start_message = ""
         return replace(reports[0], loss=loss, message=message or None)
 
     def _average_gradients(self, step: int, losses: Sequence[float]) -> float:
@@ -268,7 +270,7 @@ class Trainer(Generic[M]):
         """Train together with other processes from now on."""
         self.processes = processes
 
-    def hold_out(self, indices: Sequence[int]) -> None:
+    def hold_out(self, indices: Iterable[int]) -> None:
         """Exclude these views from training from now on."""
         self.held_out = frozenset(indices)
 
@@ -363,17 +365,3 @@ class Trainer(Generic[M]):
             )
 
         return is_eligible if any(is_eligible(i) for i in range(len(self.images))) else may_train
-
-
-@contextmanager
-def _random_numbers(generator: torch.Generator, seed: int | None) -> Iterator[None]:
-    """Use ``seed`` for ``generator`` within the context. None keeps its state."""
-    if seed is None:
-        yield
-        return
-    own = generator.get_state()
-    generator.manual_seed(seed)
-    try:
-        yield
-    finally:
-        generator.set_state(own)
