@@ -166,7 +166,6 @@ class ImageLoader:
         times: times of the views in [0, 1] or None.
         camera_correction: returns the corrected camera of an image, given its index and the camera
             of the capture; None: no correction.
-        waited_seconds: time in which requested images were decoded.
     """
 
     def __init__(
@@ -200,7 +199,7 @@ class ImageLoader:
         self._pending: dict[int, Future[Decoded]] = {}
         self._last_map: tuple[object, LensMap] | None = None
         self._lock = Lock()
-        self.waited_seconds = 0.0
+        self._waited_seconds = 0.0
         self._num_waited = 0
         check_files(self.views)
 
@@ -315,15 +314,16 @@ class ImageLoader:
         return 0 if is_whole else 2 * self._threads
 
     @property
-    def is_cacheable(self) -> bool:
-        """Whether the cache can hold all images, so that each one is decoded once."""
-        return self._bytes_of_all() <= self._cache.room
+    def decoding_seconds(self) -> float:
+        """Time in which requested images were decoded, if each one is decoded only once. 0 if the
+        cache cannot hold all images."""
+        return self._waited_seconds if self._bytes_of_all() <= self._cache.room else 0.0
 
     @property
     def decoding_seconds_left(self) -> float:
-        """Expected time to decode the images that are not cached yet."""
+        """Expected time to decode the images that are not cached yet; 0 as ``decoding_seconds``."""
         pending = sum((i, 1) not in self._cache.images for i in range(len(self)))
-        return pending * self.waited_seconds / max(self._num_waited, 1)
+        return pending * self.decoding_seconds / max(self._num_waited, 1)
 
     @property
     def sizes(self) -> list[tuple[int, int]]:
@@ -356,7 +356,7 @@ class ImageLoader:
             return found
         begun = time.perf_counter()
         image = self._on_demand(index) if pending is None else pending.result()
-        self.waited_seconds += time.perf_counter() - begun
+        self._waited_seconds += time.perf_counter() - begun
         self._num_waited += 1
         found = {name: copy_async(x, self._device) for name, x in image.items()}
         size = _num_bytes(found)

@@ -46,7 +46,7 @@ def fit_minutes(
     while True:
         trainer = build(plan)
         forecast = _measured(trainer, 0.05 * seconds)
-        left = AIM * seconds - stopwatch.seconds - _decoding_seconds_left(trainer.images)
+        left = AIM * seconds - stopwatch.seconds - trainer.images.decoding_seconds_left
         steps = fitting_steps(forecast, plan.resolved, 0, left, asked)
         side = max(map(max, trainer.images.sizes))
         if steps >= min(FEWEST, asked) or side < 2 * SMALLEST_SIDE:
@@ -70,9 +70,9 @@ def _measured(trainer: Trainer[Any], seconds: float) -> TimeForecast:
     last = min(WARM_UP + 20, trainer.config.train.steps)
     forecast = _forecast(trainer, begun)
     while trainer.done < last:
-        waited = _decoding_seconds(trainer.images)
+        waited = trainer.images.decoding_seconds
         trainer.step()
-        forecast.exclude(_decoding_seconds(trainer.images) - waited)
+        forecast.exclude(trainer.images.decoding_seconds - waited)
         now = time.perf_counter()
         if trainer.done == WARM_UP < last:
             forecast = _forecast(trainer, now)
@@ -82,15 +82,6 @@ def _measured(trainer: Trainer[Any], seconds: float) -> TimeForecast:
         if now - begun > seconds and trainer.done > WARM_UP:
             break
     return forecast
-
-
-def _decoding_seconds(images: ImageLoader) -> float:
-    """Return the seconds of decoding until now, or 0 if the cache is too small for all images."""
-    return images.waited_seconds if images.is_cacheable else 0.0
-
-
-def _decoding_seconds_left(images: ImageLoader) -> float:
-    return images.decoding_seconds_left if images.is_cacheable else 0.0
 
 
 def _forecast(trainer: Trainer[Any], now: float) -> TimeForecast:
@@ -139,9 +130,9 @@ class TimeLimit:
             return None
         if self._forecast is None:  # the first step includes loading and compilation
             self._forecast = _forecast(trainer, now)
-            self._waited = _decoding_seconds(trainer.images)
+            self._waited = trainer.images.decoding_seconds
             return None
-        waited = _decoding_seconds(trainer.images)
+        waited = trainer.images.decoding_seconds
         self._forecast.exclude(waited - self._waited)
         self._waited = waited
         self._forecast.observe(config, done, now, trainer.num_gaussians)
@@ -150,7 +141,7 @@ class TimeLimit:
         if not self._corrections or done < self._corrections[0] * loop.total:
             return None
         del self._corrections[0]
-        left = AIM * self.seconds - now - _decoding_seconds_left(trainer.images)
+        left = AIM * self.seconds - now - trainer.images.decoding_seconds_left
         found = fitting_steps(self._forecast, config, done, left, self.most_steps)
         is_small = abs(found - loop.total) <= 0.04 * loop.total
         new = with_steps(config, found)
