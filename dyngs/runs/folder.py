@@ -6,6 +6,7 @@ after killed processes, the list of input files, and the coordinate frame set by
 
 from __future__ import annotations
 
+import filecmp
 import json
 import math
 import os
@@ -26,7 +27,7 @@ from dyngs.data.read import read_capture
 from dyngs.io.fields import read_limited
 from dyngs.io.formats.similarity import AXES, IDENTITY, Similarity, similarity_from_numbers
 from dyngs.io.outputs import LOCK_NAME, Inputs, atomic_folder, lock_folder
-from dyngs.io.write import remove_leftovers, remove_quietly, temporary_folder_beside, write_text
+from dyngs.io.write import remove_leftovers, write_text
 from dyngs.models.kind import PredictsScenes, capability
 from dyngs.runs.capture_record import RECORD_NAME, require_same_capture
 from dyngs.runs.checkpoint import (
@@ -54,15 +55,18 @@ def write_config(config: Config, folder: Path) -> None:
     own = folder.absolute() / BODY_FOLDER
     if body is not None and (own.is_dir() or (body / _PARAMETERS[0]).is_file()):
         if not own.is_dir():
-            _copy_fit(body, own)
-        config = _with_body(config, own)
+            with atomic_folder(own, require_empty) as started:
+                for name in _KEPT:
+                    if (body / name).is_file():
+                        shutil.copyfile(body / name, started / name)
+        config = _with_data(config, body=own)
     save_config(config, folder / RESOLVED_NAME)
 
 
 def share_body_path(config: Config, stored: Config) -> Config:
     """Return ``config`` with ``data.body`` of ``stored`` if both fits are equal."""
     return (
-        _with_body(config, stored.data.body)
+        _with_data(config, body=stored.data.body)
         if is_same_body(config.data.body, stored.data.body)
         else config
     )
@@ -72,34 +76,14 @@ def is_same_body(one: Path | None, other: Path | None) -> bool:
     """Return whether two values of ``data.body`` have the same body parameters."""
     if one == other or one is None or other is None:
         return one == other
-    return (one / _PARAMETERS[0]).is_file() and all(
-        _content(one / x) == _content(other / x) for x in _PARAMETERS
-    )
+    stored = [name for name in _PARAMETERS if (one / name).exists() or (other / name).exists()]
+    same, _, _ = filecmp.cmpfiles(one, other, stored, shallow=False)
+    return bool(stored) and same == stored
 
 
-def _with_body(config: Config, body: Path | None) -> Config:
-    return config.model_copy(update={"data": config.data.model_copy(update={"body": body})})
-
-
-def _copy_fit(body: Path, own: Path) -> None:
-    """Copy a fit to the new folder ``own``, atomically."""
-    started = temporary_folder_beside(own)
-    try:
-        for name in _KEPT:
-            if (body / name).is_file():
-                shutil.copyfile(body / name, started / name)
-        started.rename(own)
-    except OSError as error:
-        raise DyngsError(f"cannot write {own}: {error.strerror or error}") from error
-    finally:
-        remove_quietly(started)
-
-
-def _content(path: Path) -> bytes | None:
-    try:
-        return path.read_bytes()
-    except OSError:
-        return None
+def _with_data(config: Config, **values: Path | None) -> Config:
+    """Return ``config`` with other ``values`` of its section ``data``."""
+    return config.model_copy(update={"data": config.data.model_copy(update=values)})
 
 
 LOG_NAME = "log.jsonl"
@@ -226,12 +210,7 @@ def update_data_root(folder: Path, data: DataConfig) -> None:
             is_network = capability(stored.model, PredictsScenes) is not None
             capture = None if is_network else read_capture(data)
             require_same_capture(folder, data, capture)
-            save_config(
-                stored.model_copy(
-                    update={"data": stored.data.model_copy(update={"root": data.root})}
-                ),
-                path,
-            )
+            save_config(_with_data(stored, root=data.root), path)
 
 
 def load_requested_config(folder: Path) -> Config:
@@ -274,9 +253,9 @@ def _found(folder: Path) -> list[str]:
     """Return the names of existing files of a run in ``folder``, those of ``_BEGUN`` last."""
     metrics = sorted(path.name for path in folder.glob("metrics*.json"))
     names = [SCENE_FILE, EXPORT_FOLDER, *metrics, *_BEGUN]
-    found = [name for name in names if (folder / name).exists() or (folder / name).is_symlink()]
+    found = [name for name in names if os.path.lexists(folder / name)]
     checkpoints = folder / "checkpoints"
-    is_taken = not checkpoints.is_dir() and (checkpoints.exists() or checkpoints.is_symlink())
+    is_taken = os.path.lexists(checkpoints) and not checkpoints.is_dir()
     return ["checkpoints", *found] if is_taken else found
 
 
