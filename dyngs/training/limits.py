@@ -9,6 +9,7 @@ from __future__ import annotations
 from dyngs.config import Config, DefaultStrategy, SceneInit
 from dyngs.core.conventions import num_sh_terms
 from dyngs.core.errors import DyngsError
+from dyngs.core.section import Section
 from dyngs.data.capture import Capture
 from dyngs.data.read import view_size
 from dyngs.models.kind import HasGaussians, HasSizeLimit, capability, find_kind
@@ -49,25 +50,25 @@ def validate_limits(config: Config) -> None:
         )
 
 
+# Keys of sections that only some model kinds support; None: all keys.
+_KIND_SPECIFIC = {
+    "budget": None,
+    "prune": None,
+    "data": {"person", "stature"},
+    "train": {"minutes", "image_every", "batch_size"},
+}
+_PRUNING_DETAILS = {"steps", "score", "signed", "mask_between"}
+
+
 def _kind_specific_options(config: Config) -> dict[str, object]:
     """Return the options, by key, that are set and that only some model kinds support."""
     given: dict[str, object] = {
         key: x for key, x in _single_image_options(config).items() if x == "always"
     }
-    for name, section in (("budget", config.budget), ("prune", config.prune)):
-        details = {"steps", "score", "signed", "mask_between"}
-        changed = section.model_dump(exclude_defaults=True, exclude=details)
+    for name, keys in _KIND_SPECIFIC.items():
+        section: Section = getattr(config, name)
+        changed = section.model_dump(exclude_defaults=True, include=keys, exclude=_PRUNING_DETAILS)
         given |= {f"{name}.{key}": value for key, value in changed.items()}
-    if config.data.person is not None:
-        given["data.person"] = config.data.person
-    if config.data.stature is not None:
-        given["data.stature"] = config.data.stature
-    if config.train.minutes is not None:
-        given["train.minutes"] = config.train.minutes
-    if config.train.image_every > 0:
-        given["train.image_every"] = config.train.image_every
-    if config.train.batch_size > 1:
-        given["train.batch_size"] = config.train.batch_size
     return given
 
 
