@@ -25,6 +25,7 @@ import torch
 from torch import Tensor
 
 from dyngs.api.predict import read_trained_network, require_network
+from dyngs.api.scene_file import num_bytes_exact
 from dyngs.api.train import train
 from dyngs.cli.output import numbers_table, print_messages, print_tables
 from dyngs.config import DataConfig
@@ -43,7 +44,6 @@ from dyngs.models.renderable import Renderable
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import load_run
 from dyngs.runs.folder import require_empty
-from dyngs.study.measure import state_megabytes
 from dyngs.study.report import Table, csv_text, markdown_table
 
 STEM = "comparison"
@@ -245,7 +245,7 @@ def _scores(
 ) -> Iterator[Score]:
     """Yield those of one person, and write the pictures."""
     scene, seconds, training = made
-    megabytes = state_megabytes(scene)
+    megabytes = 1e-6 * num_bytes_exact(scene)
     boxes(scene, images[0])  # what is found out once is not part of a picture's time
     for image in (images[i] for i in range(len(images))):
         start = time.process_time()

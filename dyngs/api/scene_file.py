@@ -18,7 +18,7 @@ from dyngs.runs.folder import (
     write_config,
     write_frame,
 )
-from dyngs.runs.stored_file import encode_scene, tensors_to_store, write_scene
+from dyngs.runs.stored_file import encode_scene, write_scene
 
 
 @dataclass(frozen=True)
@@ -64,4 +64,4 @@ def write_scene_file(
 
 def num_bytes_exact(scene: Renderable) -> int:
     """Return the size in bytes of the tensors that rendering needs, in memory."""
-    return sum(x.numel() * x.itemsize for x in tensors_to_store(scene).values())
+    return sum(x.tensor.nbytes for x in scene.drawing_state().values())

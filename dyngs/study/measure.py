@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import torch
 from pydantic import Field, TypeAdapter
 
+from dyngs.api.scene_file import num_bytes_exact
 from dyngs.core.errors import format_count, log_info
 from dyngs.core.metrics import load_lpips
 from dyngs.data.loader import ImageLoader
@@ -146,7 +147,7 @@ class SceneMeasurer:
             rendered = drawing.image(image.cameras, image.time)
             write_image(images / study_scene.slug / file, rendered.cpu().numpy())
             views.append((image.name, scores[i].psnr))
-        mb = state_megabytes(drawing.scene)
+        mb = 1e-6 * num_bytes_exact(drawing.scene)
         if has_only_scene_file(folder):
             mb = 1e-6 * (folder / SCENE_FILE).stat().st_size
         run = load_run(study_scene.run_dir)
@@ -205,11 +206,6 @@ class SceneMeasurer:
                     found[i] = replace(found[i], ms=1e3 * median(own.tolist()), gain=gain)
                     write_stored(self.measurement_path(study_scenes[i].slug), asdict(found[i]))
         return found
-
-
-def state_megabytes(scene: Renderable) -> float:
-    """Return the size of all parameters needed for rendering, in 1e6 bytes."""
-    return 1e-6 * sum(x.tensor.nbytes for x in scene.drawing_state().values())
 
 
 def _count(scene: Renderable) -> int:
