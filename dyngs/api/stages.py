@@ -30,7 +30,6 @@ from dyngs.training.new_trainer import add_initial_points
 from dyngs.training.plan import (
     Limits,
     RunPlan,
-    describe_extension,
     extend_config,
     with_length,
     with_steps,
@@ -181,5 +180,8 @@ def extend_run(plan: RunPlan, folder: Path, resumed: Checkpoint | None) -> RunPl
     write_requested_config(folder, requested)
     config = extend_config(with_steps(config, stored.train.steps), done, steps)
     config = with_length(config, steps, minutes)
-    log_info(describe_extension(stored, longer, done))
+    log_info(
+        f"resuming at step {done:,}, extended from {stored.train.steps:,} to "
+        f"{format_count(steps, 'step')}; schedules rescaled"
+    )
     return replace(plan, requested=requested, resolved=config, is_extended=True)

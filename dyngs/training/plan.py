@@ -105,18 +105,6 @@ def _require_exposures_stay(config: Config, length: LengthChange) -> None:
         )
 
 
-def describe_extension(before: Config, after: Config, done: int) -> str:
-    """Return a log message about a run that continues after ``done`` steps."""
-    steps = after.train.steps
-    is_free = before.train.minutes is not None and after.train.minutes is None
-    no_limit = "; without a time limit" if is_free else ""
-    return (
-        f"resuming at step {done:,}, extended from {before.train.steps:,} to "
-        f"{format_count(steps, 'step')}; "
-        f"schedules rescaled{no_limit}"
-    )
-
-
 def _train(options: TrainConfig, length: LengthChange) -> TrainConfig:
     changed: dict[str, object] = {"steps": length.steps, "minutes": None}
     full_at = max(options.resolution_grows_from, options.resolution_full_at)
