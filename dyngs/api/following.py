@@ -59,7 +59,7 @@ def run_processes(lead: Callable[[Processes], int]) -> int:
     """Run in the processes started by ``torchrun`` and return the exit code: rank 0 calls ``lead``,
     the others follow."""
     with Processes.from_torchrun() as processes:
-        if not processes.is_rank_zero:
+        if processes.rank != 0:
             return EXIT_INTERRUPTED if run_follower(processes) else 0
         try:
             code = lead(processes)

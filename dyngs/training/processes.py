@@ -13,7 +13,6 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from datetime import timedelta
-from types import TracebackType
 from typing import Any
 
 import torch
@@ -41,7 +40,7 @@ class Processes:
     message.
 
     Args:
-        rank: number of this process, from 0.
+        rank: number of this process, from 0. Only rank 0 reads the config, writes files and logs.
         size: number of processes.
         local_size: number of processes on this machine.
     """
@@ -66,11 +65,6 @@ class Processes:
                 f"environment variables {', '.join(_NAMES)}: must be integers, as set by torchrun"
             ) from None
 
-    @property
-    def is_rank_zero(self) -> bool:
-        """True on rank 0, the only process that reads the config, writes files and logs."""
-        return self.rank == 0
-
     def __enter__(self) -> Processes:
         if self.size == 1:
             return self
@@ -90,12 +84,7 @@ class Processes:
             ) from None
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         """Disconnect. Raise SystemExit instead of an error if another process has reported one."""
         if self.size == 1:
             return
