@@ -93,7 +93,9 @@ def memory_forecasts(trainer: Trainer[Any], processes: int = 1) -> list[MemoryFo
     files = max((view.width * view.height for view in images.views), default=0)
     decoded = images.pending_bytes + (images.num_prefetched // 2 or 1) * DECODING * files
     count = expected_gaussians(config, trainer.num_gaussians, side)
-    gaussians = count * gaussian_bytes(config)
+    # trained values per Gaussian, without those of a deformation field
+    values = SHAPE_VALUES + 3 * num_sh_terms(config.stored_sh_degree)
+    gaussians = count * (4 * COPIES * values + config.model.bytes_per_moving_gaussian)
     drawing = STEP + DRAWING * pixels
     largest = max(
         (decoded, "data.cache_mb", 1e-6 * decoded, 1.0),
@@ -112,16 +114,6 @@ def memory_forecasts(trainer: Trainer[Any], processes: int = 1) -> list[MemoryFo
         MemoryForecast("GPU memory", 0, shown, *scene, gpu[0], each, largest),
         MemoryForecast("memory", program, decoded, STEP, 0, 0, free, processes, largest),
     ]
-
-
-def stored_values(config: Config) -> int:
-    """Return the number of trained values per Gaussian, without those of a deformation field."""
-    return SHAPE_VALUES + 3 * num_sh_terms(config.stored_sh_degree)
-
-
-def gaussian_bytes(config: Config) -> int:
-    """Return the bytes of training memory per Gaussian, including motion if the model has any."""
-    return 4 * COPIES * stored_values(config) + config.model.bytes_per_moving_gaussian
 
 
 def expected_gaussians(config: Config, now: int, longest_side: int = 400) -> int:
