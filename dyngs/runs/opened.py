@@ -223,11 +223,9 @@ class OpenedScene(LoadedRun, Cache):
         Raises:
             DyngsError: it is no person, or the file cannot be read.
         """
-        wanted = f"--motion {path}"
-        person = self.require_person(wanted)
+        person = self.require_person(f"--motion {path}")
         body = capability(self.config.model, HasBody)
-        if body is None:
-            raise self._no_person(wanted)
+        assert body is not None
         found = body.play_motion(self.config.model, person, self.info, path)
         notes = (*self.notes, *found.notes)
         return replace(self, renderable=found.scene, fps=found.fps, as_captured=False, notes=notes)
@@ -252,14 +250,11 @@ class OpenedScene(LoadedRun, Cache):
     def require_person(self, wanted: str) -> Posable:
         """Return the person. Raises DyngsError: ``wanted`` needs one, and it is none."""
         if self.person is None:
-            raise self._no_person(wanted)
+            kind = self.config.model.kind
+            raise DyngsError(
+                f"{wanted} needs the run of a person (model.kind=human), this one is {kind}"
+            )
         return self.person
-
-    def _no_person(self, wanted: str) -> DyngsError:
-        kind = self.config.model.kind
-        return DyngsError(
-            f"{wanted} needs the run of a person (model.kind=human), this one is {kind}"
-        )
 
 
 def open_scene(
@@ -313,10 +308,12 @@ def open_run(
     edited = read_frame(folder)
     captured = None
     if with_capture:
+        data = run.config.data
         try:
-            captured = SourceCapture(run.config.data, read_run_capture(run.config.data, run.info))
+            found = read_run_capture(data, run.info)
         except DyngsError as error:
-            captured = SourceCapture(run.config.data, error)
+            found = error
+        captured = SourceCapture(data, found)
     opened = OpenedScene(**vars(run), name=folder.absolute().name, captured=captured, path=folder)
     if edited is None:
         return opened
