@@ -28,7 +28,6 @@ from dyngs.runs.folder import EXPORT_FOLDER, write_requested_config
 from dyngs.training.limits import apply_gaussian_cap, apply_pixel_cap, gaussian_limit
 from dyngs.training.new_trainer import add_initial_points
 from dyngs.training.plan import (
-    Limits,
     RunPlan,
     extend_config,
     with_length,
@@ -142,13 +141,10 @@ def set_limits(plan: RunPlan) -> RunPlan:
     config = plan.resolved
     minutes = config.train.minutes
     num_times = 0 if plan.capture is None else len(set(training_times(plan.capture)))
-    limits = Limits(
-        gaussians=gaussian_limit(config, num_times),
-        megabytes=config.budget.max_mb,
-        seconds=None if minutes is None else 60 * minutes,
-    )
-    capped = apply_gaussian_cap(config, limits.gaussians)
-    return replace(plan, resolved=capped, uncapped=config, limits=limits)
+    seconds = None if minutes is None else 60 * minutes
+    most = gaussian_limit(config, num_times)
+    capped = apply_gaussian_cap(config, most)
+    return replace(plan, resolved=capped, uncapped=config, max_gaussians=most, seconds=seconds)
 
 
 def extend_run(plan: RunPlan, folder: Path, resumed: Checkpoint | None) -> RunPlan:

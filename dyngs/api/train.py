@@ -187,7 +187,7 @@ def train(
             with progress() as report:
                 plan = run_pilots(plan, report)
             plan = set_limits(find_first_gaussians(plan))
-            if plan.limits.seconds is not None:
+            if plan.seconds is not None:
                 plan, message, images = fit_minutes(plan, stopwatch, _built)
                 if message:
                     log_info(message)
@@ -258,14 +258,13 @@ class _Run:
         editors: list[Editor] = []
         if isinstance(trainer, Trainer):
             editors = [remove_floaters]
-            limits = plan.limits
-            if limits.seconds is not None:
+            if plan.seconds is not None:
                 corrects = resumed is None or plan.is_extended
                 steps = plan.requested.train.steps
-                self._time = TimeLimit(limits.seconds, steps, corrects=corrects)
+                self._time = TimeLimit(plan.seconds, steps, corrects=corrects)
                 editors.append(self._time)
-            if limits.gaussians is not None:
-                self._count = CountLimit(limits.gaussians, limits.seconds)
+            if plan.max_gaussians is not None:
+                self._count = CountLimit(plan.max_gaussians, plan.seconds)
                 editors.append(self._count)
             if trainer.num_gaussians:
                 _show_memory(trainer, processes.local_size)
@@ -352,9 +351,7 @@ class _Run:
                     return
                 if evaluates:
                     self._evaluate(step)
-                elif options.eval_psnr and (
-                    is_last or (is_regular and self._plan.limits.seconds is None)
-                ):
+                elif options.eval_psnr and (is_last or (is_regular and self._plan.seconds is None)):
                     self._measure_psnr(step)
 
     def _save(self) -> None:
@@ -424,8 +421,9 @@ class _Run:
                 steps = self._time.most_steps
                 resume = f"dyngs train --resume {quote_path(self.folder)} train.steps={steps}"
                 yield f"{cost}; this run goes on to that with `{resume}`"
-        if isinstance(trainer, Trainer) and self._plan.limits.megabytes is not None:
-            yield str(write_limited_file(trainer, self.folder, self._plan.limits.megabytes))
+        megabytes = self.config.budget.max_mb
+        if isinstance(trainer, Trainer) and megabytes is not None:
+            yield str(write_limited_file(trainer, self.folder, megabytes))
 
 
 def _show_memory(trainer: Trainer[Any], processes: int) -> None:

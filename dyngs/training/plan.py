@@ -16,21 +16,6 @@ from dyngs.training.losses import AddedLoss
 
 
 @dataclass(frozen=True)
-class Limits:
-    """Limits of a run. None means no limit.
-
-    Attributes:
-        gaussians: number of Gaussians at the end.
-        megabytes: file size of the scene, in 1e6 bytes.
-        seconds: training time.
-    """
-
-    gaussians: int | None = None
-    megabytes: float | None = None
-    seconds: float | None = None
-
-
-@dataclass(frozen=True)
 class RunPlan:
     """A run before its first step.
 
@@ -40,6 +25,8 @@ class RunPlan:
         uncapped: resolved config without the limit on Gaussians, used for initialisation.
         capture: None for a network, which has several, and until it is read.
         first: Gaussians of another scene to start from.
+        max_gaussians: largest number of Gaussians at the end; None: no limit.
+        seconds: limit on the training time; None: no limit.
         choice: result of pilot runs.
         losses: of the user, in addition to those of the config.
         is_extended: whether a finished or interrupted run is extended.
@@ -50,7 +37,8 @@ class RunPlan:
     uncapped: Config | None = None
     capture: Capture | None = None
     first: InitialGaussians | None = None
-    limits: Limits = Limits()
+    max_gaussians: int | None = None
+    seconds: float | None = None
     choice: Any = None
     losses: tuple[AddedLoss, ...] = ()
     is_extended: bool = False

@@ -40,7 +40,7 @@ def fit_minutes(
         stopwatch: training time so far.
         build: returns a new trainer for a plan, used for timing only.
     """
-    seconds = plan.limits.seconds or math.inf
+    seconds = plan.seconds or math.inf
     asked = plan.resolved.train.steps
     message = None
     while True:
