@@ -103,10 +103,6 @@ class Variant:
         """The changed setting, "" for the original run, ``SEVERAL`` for combinations."""
         return SEVERAL if len(self.settings) > 1 else " + ".join(self.changes)
 
-    def merged(self, other: Variant) -> Variant:
-        """Return this variant with the changes of ``other`` applied on top."""
-        return replace(self, **other.changes)
-
 
 # Settings that can be varied and their default values, in order of increasing compression
 SETTINGS: dict[str, tuple[Value, ...]] = {
@@ -386,7 +382,7 @@ def combinations(found: Mapping[Variant, Measurement], count: int) -> list[Varia
         for _, _, strength, change in sorted(costs, key=lambda item: item[:2]):
             (setting,) = change.settings
             if strength > strongest.get(setting, -1):
-                now = now.merged(change)
+                now = replace(now, **change.changes)
                 strongest[setting] = strength
                 if len(now.settings) > 1:
                     steps.append(now)
