@@ -51,19 +51,10 @@ class Processes:
 
     @staticmethod
     def from_torchrun() -> Processes:
-        """Return the processes that ``torchrun`` started, or a single one without it.
-
-        Raises:
-            DyngsError: invalid environment variables.
-        """
+        """Return the processes that ``torchrun`` started, or a single one without it."""
         if any(name not in os.environ for name in (*_NAMES, "MASTER_ADDR", "MASTER_PORT")):
             return Processes()
-        try:
-            return Processes(*(int(os.environ[name]) for name in _NAMES))
-        except ValueError:
-            raise DyngsError(
-                f"environment variables {', '.join(_NAMES)}: must be integers, as set by torchrun"
-            ) from None
+        return Processes(*(int(os.environ[name]) for name in _NAMES))
 
     def __enter__(self) -> Processes:
         if self.size == 1:
