@@ -20,7 +20,7 @@ from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.initialization import InitialGaussians, scene_geometry
 from dyngs.gaussians.model import GaussianModel
 from dyngs.models.kind import HasMotion, StartContext, find_kind
-from dyngs.models.model import Loss
+from dyngs.models.model import Correction, Loss
 from dyngs.models.views import (
     background_colour,
     background_coloured_fraction,
@@ -61,7 +61,7 @@ def build_trainer(
     """Return the trainer of a scene with an initialised, untrained model.
 
     Args:
-        capture: as returned by ``prepare_capture``. None reads it.
+        capture: with initial points. None reads it.
         restored: a checkpoint will be restored, so initial points are not needed.
         images: training images of another trainer of the same capture. None opens them.
         first: Gaussians to start from. None initialises them as in ``config.init``.
@@ -70,7 +70,9 @@ def build_trainer(
         added_losses: losses of the user.
     """
     if capture is None:
-        capture = read_capture(config.data) if restored else prepare_capture(config)
+        capture = read_capture(config.data)
+        if not restored:
+            capture = add_initial_points(require_images(capture), config)
     generator = torch.Generator().manual_seed(config.run.seed)
     if images is None:
         images = ImageLoader(
@@ -97,28 +99,28 @@ def build_trainer(
         model = kind.start(start)
         steps = config.train.steps
         views = images.views
-        refinement = None
+        refinements: list[Correction] = []
         if config.camera.refine == "always":
             refinement = CameraRefinement(views, extent, steps)
             correct_cameras = refinement.corrections.correct_cameras
             images.camera_correction = lambda index, cameras: correct_cameras(views[index], cameras)
-        robust = None
+            refinements = [refinement]
+        masks: list[Correction] = []
         may_mask = "train.robust" in kind.uses and not isinstance(kind, HasMotion)
         if config.train.robust == "always" and may_mask:
             cameras = training_cameras(views, config.data)
-            robust = RobustMasks(images, cameras, steps, images.camera_correction)
-        exposures = None
+            masks = [RobustMasks(images, cameras, steps, images.camera_correction)]
+        exposures: list[ViewExposures] = []
         if config.train.exposure == "always":
-            exposures = ViewExposures(len(images), steps, images)
+            exposures = [ViewExposures(len(images), steps, images)]
         losses = [
             model.colour_loss or ImageLoss(config.train.ssim_weight),
             SilhouetteLoss(config.train.alpha_weight, early, FULL_OPACITY_FROM * steps),
-            *([] if exposures is None else [exposures]),
+            *exposures,
             priors,
             *added_losses,
         ]
-        found = (robust, exposures, refinement)
-        return TrainerParts(model, losses, [x for x in found if x is not None])
+        return TrainerParts(model, losses, [*masks, *exposures, *refinements])
 
     return Trainer(
         config=config,
@@ -131,11 +133,6 @@ def build_trainer(
         start_message=priors.message,
         device=select_device(config.run.device),
     )
-
-
-def prepare_capture(config: Config) -> Capture:
-    """Read the capture of a run and add the initial points. Logs problems of the capture."""
-    return add_initial_points(require_images(read_capture(config.data)), config)
 
 
 def add_initial_points(
