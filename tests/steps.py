@@ -31,7 +31,6 @@ class Counting:
     bad_gradients: int = 0
     num_gaussians: int = 1234
     num_moving: int = 56
-    has_test_views: bool = False
     messages: dict[int, str] = field(default_factory=dict)
     failures: dict[int, str] = field(default_factory=dict)
     config: Config = field(default_factory=lambda: CONFIG)

@@ -57,7 +57,7 @@ from dyngs.runs.folder import (
     collect_inputs,
     default_run_dir,
     is_finished,
-    is_stopped_before_checkpoint,
+    load_begun_config,
     load_requested_config,
     remove_partial_files,
     require_startable,
@@ -253,6 +253,7 @@ class _Run:
         self._plan = plan
         self._processes = processes
         self.folder = folder
+        self._has_test_views = plan.capture is not None and bool(plan.capture.splits.get("test"))
         self._count = None
         self._time = None
         editors: list[Editor] = []
@@ -347,7 +348,7 @@ class _Run:
                 is_regular = self._save_timer.is_due(event.seconds)
                 if evaluates or is_last or is_due or is_regular:
                     self._save()
-                if not event.loop.trainer.has_test_views:
+                if not self._has_test_views:
                     return
                 if evaluates:
                     self._evaluate(step)
@@ -398,7 +399,7 @@ class _Run:
         photo."""
         start = time.perf_counter()
         trainer: Any = self.loop.trainer
-        split = "test" if trainer.has_test_views else "train"
+        split = "test" if self._has_test_views else "train"
         views = trainer.capture.splits[split]
         image = ImageLoader(views[:1], self.config.data)[0].to(trainer.device)
         background = background_colour(trainer.background)
@@ -437,7 +438,7 @@ def _show_memory(trainer: Trainer[Any], processes: int) -> None:
 
 def _newest(folder: Path) -> Checkpoint | None:
     """Return the newest valid checkpoint; None for a run that was stopped before its first."""
-    if is_stopped_before_checkpoint(folder):
+    if load_begun_config(folder) is not None:
         return None
     checkpoint = latest_checkpoint(folder)
     remove_old_checkpoints(folder)

@@ -163,7 +163,7 @@ def _require_export_of(config: Config, folder: Path) -> None:
 
 def require_startable(folder: Path, config: Config) -> None:
     """Raise DyngsError if ``folder`` has files of another run, or checkpoints of this run."""
-    begun = _config_of_begun(folder)
+    begun = load_begun_config(folder)
     paths = checkpoint_paths(folder)
     found = _found(folder)
     go_on = f"`dyngs train --resume {quote_path(folder)}`, or give another run.dir"
@@ -226,14 +226,9 @@ def _matches_request(folder: Path, config: Config) -> bool:
         return False
 
 
-def is_stopped_before_checkpoint(folder: Path) -> bool:
-    """Return whether ``folder`` has a run that was stopped before its first checkpoint."""
-    return _config_of_begun(folder) is not None
-
-
 def write_new_config(folder: Path, config: Config) -> None:
     """Write the configuration of a new run, unless ``folder`` has it already."""
-    begun = _config_of_begun(folder)
+    begun = load_begun_config(folder)
     if begun is None or not _is_same_run(begun, config):
         write_config(config, folder)
 
@@ -259,7 +254,7 @@ def _found(folder: Path) -> list[str]:
     return ["checkpoints", *found] if is_taken else found
 
 
-def _config_of_begun(folder: Path) -> Config | None:
+def load_begun_config(folder: Path) -> Config | None:
     """Return the configuration of a run stopped before its first checkpoint; None if there is
     none."""
     found = _found(folder)

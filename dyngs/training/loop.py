@@ -47,9 +47,6 @@ class Trainable(Protocol):
         """Number of Gaussians that depend on time or pose."""
         ...
 
-    @property
-    def has_test_views(self) -> bool: ...
-
     def step(self) -> StepReport:
         """Run one training step."""
         ...

@@ -36,7 +36,6 @@ class NetworkTrainer:
     done: int = 0
     num_gaussians: int = 0  # of the last predicted person
     bad_gradients: int = 0
-    has_test_views: bool = False
 
     @property
     def num_moving(self) -> int:

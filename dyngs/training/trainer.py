@@ -147,10 +147,6 @@ class Trainer(Generic[M]):
         self.place(self.device)
 
     @property
-    def has_test_views(self) -> bool:
-        return bool(self.capture.splits.get("test"))
-
-    @property
     def num_gaussians(self) -> int:
         return self.model.num_gaussians
 
