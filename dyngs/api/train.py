@@ -48,7 +48,6 @@ from dyngs.runs.checkpoint import (
     Checkpoint,
     describe_last_checkpoint,
     latest_checkpoint,
-    remove_old_checkpoints,
     save_checkpoint,
     seconds_at,
 )
@@ -171,13 +170,18 @@ def train(
             is_done = is_finished(folder, plan.resolved)
         else:
             update_data_root(folder, plan.resolved.data)
-            resumed = _newest(folder)
+            if load_begun_config(folder) is None:  # else stopped before its first checkpoint
+                resumed = latest_checkpoint(folder)
             plan = replace(plan, requested=load_requested_config(folder))
             plan = extend_run(plan, folder, resumed)
             is_done = resumed is not None and resumed.info.step >= plan.resolved.total_steps
         has_export = plan.resolved.budget.max_mb is None or has_file(folder)
         if is_done and has_export:
-            log_info(_about_finished(plan.resolved, folder))
+            advice = f"`dyngs train --resume {quote_path(folder)} train.steps=N` trains longer"
+            if plan.resolved.prune.is_enabled:
+                advice = "give another run.dir to train again"
+            steps = format_count(plan.resolved.total_steps, "step")
+            log_info(f"{folder}: run already finished ({steps}); {advice}")
             return folder
         if resume_from is None:
             require_startable(folder, plan.resolved)
@@ -222,14 +226,6 @@ def _built(
     if resumed is not None:
         trainer.restore(resumed)
     return trainer
-
-
-def _about_finished(config: Config, folder: Path) -> str:
-    run = quote_path(folder)
-    longer = f"`dyngs train --resume {run} train.steps=N` trains longer"
-    if config.prune.is_enabled:
-        longer = "give another run.dir to train again"
-    return f"{folder}: run already finished ({format_count(config.total_steps, 'step')}); {longer}"
 
 
 class _Run:
@@ -434,15 +430,6 @@ def _show_memory(trainer: Trainer[Any], processes: int) -> None:
         warning = forecast.warning()
         if warning is not None:
             log_warning(warning)
-
-
-def _newest(folder: Path) -> Checkpoint | None:
-    """Return the newest valid checkpoint; None for a run that was stopped before its first."""
-    if load_begun_config(folder) is not None:
-        return None
-    checkpoint = latest_checkpoint(folder)
-    remove_old_checkpoints(folder)
-    return checkpoint
 
 
 def _num_threads(config: Config, processes: Processes) -> int:

@@ -8,7 +8,6 @@ A run folder holds ``config.yaml`` (resolved), ``checkpoints/step_0007000.safete
 from __future__ import annotations
 
 import json
-import math
 import os
 import re
 from dataclasses import asdict, dataclass, replace
@@ -58,12 +57,6 @@ def checkpoint_paths(run_dir: Path) -> list[Path]:
     return sorted((f for f in found if re.fullmatch(r"step_[0-9]+", f.stem)), key=checkpoint_step)
 
 
-def remove_old_checkpoints(run_dir: Path) -> None:
-    """Remove all but the newest ``KEEP_CHECKPOINTS`` of a run."""
-    for old in checkpoint_paths(run_dir)[:-KEEP_CHECKPOINTS]:
-        old.unlink(missing_ok=True)
-
-
 def checkpoint_step(path: Path) -> int:
     """Return the step of a checkpoint, from its file name."""
     return int(path.stem.removeprefix("step_"))
@@ -88,7 +81,8 @@ def save_checkpoint(run_dir: Path, checkpoint: Checkpoint, seconds_train: float)
     _write_seconds(run_dir, checkpoint.info.step, seconds_train)
     header = asdict(checkpoint.info) | {"settings": checkpoint.settings}
     write_tensors(path, _KIND, tensors, header, ", then `dyngs train --resume`")
-    remove_old_checkpoints(run_dir)
+    for old in checkpoint_paths(run_dir)[:-KEEP_CHECKPOINTS]:
+        old.unlink(missing_ok=True)
     return path
 
 
@@ -154,10 +148,7 @@ def seconds_at(run_dir: Path, step: int) -> float:
 def _read_seconds(run_dir: Path) -> dict[str, float]:
     try:
         stored = json.loads(read_limited(run_dir / TIMING_NAME, _MOST_TIMING_BYTES))
-        known = {
-            str(int(step)): float(seconds) for step, seconds in stored["seconds_train"].items()
-        }
-        return {step: seconds for step, seconds in known.items() if math.isfinite(seconds)}
+        return {str(int(step)): float(x) for step, x in stored["seconds_train"].items()}
     except Exception:  # a missing or damaged file only loses the times
         return {}
 
