@@ -318,8 +318,8 @@ def _input_paths(one: Read) -> Iterator[Path]:
             if one.name == SCENE_FILE and (one.parent / RESOLVED_NAME).is_file():
                 yield from _input_paths(one.parent)
         case LoadedRun():
-            if one.config.run.dir is not None and (one.config.run.dir / RESOLVED_NAME).is_file():
-                yield from _files_of_run(one.config.run.dir)
+            if one.config.run.dir is not None:
+                yield from _input_paths(one.config.run.dir)
             yield from _input_paths(one.config)
         case Capture():
             yield one.root
