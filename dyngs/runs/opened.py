@@ -350,10 +350,9 @@ def wrap_scene(scene: Renderable, file: Path = Path("scene")) -> OpenedScene:
 def cameras_for_paths(views: Sequence[View], data: DataConfig) -> Cameras:
     """Return the cameras of V views, all with size and intrinsics of the first (downscaled,
     undistorted)."""
-    (first,) = training_cameras(views[:1], data)
-    poses = torch.from_numpy(np.stack([view.cam_from_world for view in views])).to(
-        first.cam_from_world
-    )
+    cameras = training_cameras(views, data)
+    first = cameras[0]
+    poses = torch.cat([camera.cam_from_world for camera in cameras])
     return Cameras(
         poses, first.intrinsics.expand(len(views), 3, 3).clone(), first.width, first.height
     )

@@ -436,8 +436,8 @@ def _filters(preset: int, size: int) -> list[dict[str, int]]:
     """Return LZMA2 filters with a dictionary for ``size`` bytes: a larger one only costs time and
     memory."""
     dictionary = min(max(1 << max(size - 1, 1).bit_length(), 2**12), 2**24)
-    own = {"id": lzma.FILTER_LZMA2, "preset": preset, "dict_size": dictionary}
-    return [own | {"lc": 4, "lp": 0, "pb": 0}]
+    method = lzma.FILTER_LZMA2
+    return [{"id": method, "preset": preset, "dict_size": dictionary, "lc": 4, "lp": 0, "pb": 0}]
 
 
 MAGIC = b"dyngs\x00\x01\n"
