@@ -62,7 +62,6 @@ from dyngs.runs.folder import (
     require_startable,
     update_data_root,
     write_config,
-    write_new_config,
     write_requested_config,
 )
 from dyngs.training.clock import SaveTimer, Stopwatch
@@ -281,7 +280,7 @@ class _Run:
         if resumed is None:
             if self._body_kind is not None:
                 self._body_kind.copy_pictures(config.data, self.folder / PICTURES)
-            write_new_config(self.folder, config)
+            write_config(config, self.folder)
             write_requested_config(self.folder, plan.requested)
             write_record(self.folder, config.data, plan.capture)
             write_choice(self.folder, plan.choice)

@@ -226,13 +226,6 @@ def _matches_request(folder: Path, config: Config) -> bool:
         return False
 
 
-def write_new_config(folder: Path, config: Config) -> None:
-    """Write the configuration of a new run, unless ``folder`` has it already."""
-    begun = load_begun_config(folder)
-    if begun is None or not _is_same_run(begun, config):
-        write_config(config, folder)
-
-
 def remove_partial_files(folder: Path, *, sole_writer: bool) -> None:
     """Remove partially written files of killed processes from a run folder.
 
