@@ -6,13 +6,10 @@ them.
 
 from __future__ import annotations
 
-import math
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from statistics import fmean
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -54,23 +51,6 @@ class StepReport:
         )
 
 
-class RecentMean:
-    """Mean of the last ``WINDOW`` finite values."""
-
-    WINDOW = 50
-
-    def __init__(self) -> None:
-        self._values = deque[float](maxlen=self.WINDOW)
-
-    def add(self, value: float) -> None:
-        if math.isfinite(value):
-            self._values.append(value)
-
-    @property
-    def value(self) -> float | None:
-        return fmean(self._values) if self._values else None
-
-
 @dataclass(frozen=True)
 class Started:
     """Training starts, or resumes after ``step`` of ``total`` steps."""
@@ -102,7 +82,7 @@ class StepDone:
     @property
     def mean_psnr(self) -> float | None:
         """Mean PSNR of the views of the last steps, dB; None if masks excluded all pixels."""
-        return self.loop.recent_psnr.value
+        return self.loop.mean_psnr
 
     @property
     def num_gaussians(self) -> int:

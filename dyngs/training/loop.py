@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import signal
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
+from statistics import fmean
 from types import FrameType
 from typing import Any, Protocol
 
@@ -18,7 +21,6 @@ from dyngs.training.events import (
     Listener,
     Message,
     Paused,
-    RecentMean,
     Started,
     StepDone,
     StepReport,
@@ -64,6 +66,8 @@ class Trainable(Protocol):
         ...
 
 
+WINDOW = 50  # Steps over which the mean PSNR is computed
+
 # Returns the edit to apply between two steps, or None
 Editor = Callable[["Loop"], TrainingEdit | None]
 
@@ -98,7 +102,7 @@ class Loop:
         self._stages = stages
         self._limits = limits
         self._before_step = before_step
-        self.recent_psnr = RecentMean()
+        self._recent_psnr = deque[float](maxlen=WINDOW)
         self._listeners: list[Listener] = []
         self._is_stopped: Callable[[], bool] = lambda: False
 
@@ -116,11 +120,18 @@ class Loop:
         while self.trainer.done < self.total and not is_stopped():
             self._edit(self._stages)
             report = self._step()
-            self.recent_psnr.add(report.sampled_psnr)
+            quality = report.sampled_psnr
+            if math.isfinite(quality):  # not where masks exclude all pixels
+                self._recent_psnr.append(quality)
             for line in (report.message or "").splitlines():
                 self.emit(Message(f"step {report.step}: {line}"))
             self._edit(self._limits)
             self.emit(StepDone(report, self))
+
+    @property
+    def mean_psnr(self) -> float | None:
+        """Mean PSNR of the views of the last ``WINDOW`` steps, dB; None if masks excluded all."""
+        return fmean(self._recent_psnr) if self._recent_psnr else None
 
     def pause(self, is_paused: Callable[[], bool]) -> None:
         """Wait while ``is_paused`` returns true, until the run is stopped. Listeners may call this.

@@ -47,6 +47,13 @@ def test_events_reach_all_listeners_in_order() -> None:
     assert events[2] == Message("step 2: something")
 
 
+def test_the_mean_psnr_is_over_the_last_steps() -> None:
+    loop = looped(Counting(), 60)
+    assert loop.mean_psnr is None
+    loop.run()
+    assert loop.mean_psnr == pytest.approx(20.0)  # images are off by 0.1
+
+
 def test_it_stops_between_two_steps() -> None:
     trainer = Counting()
     loop = looped(trainer, 9)

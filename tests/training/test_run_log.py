@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import json
-import math
 from pathlib import Path
 
 from steps import step_done
 
-from dyngs.training.events import Evaluated, Message, RecentMean
+from dyngs.training.events import Evaluated, Message
 from dyngs.training.run_log import RunLog
 
 
@@ -46,16 +45,3 @@ def test_it_listens_to_steps_and_scores(tmp_path: Path) -> None:
     )
     scores = {"step": 12, "split": "test", "psnr": 21.0, "ssim": 0.9, "num_views": 4}
     assert lines[-1] == scores
-
-
-def test_the_recent_mean_is_over_the_last_finite_values() -> None:
-    constant = RecentMean()
-    assert constant.value is None
-    for _ in range(3):
-        constant.add(28.0)
-        constant.add(math.nan)  # a view without visible pixels
-    assert constant.value == 28.0
-    ramp = RecentMean()
-    for value in range(200):
-        ramp.add(float(value))
-    assert ramp.value == 174.5  # mean of 150 to 199
