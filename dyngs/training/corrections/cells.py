@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool2d
 
 from dyngs.core.camera import Cameras
 
@@ -21,6 +22,12 @@ def cell_camera(cameras: Cameras) -> Cameras:
     width, height = cameras.width, cameras.height
     fraction = CELLS / max(width, height)
     return cameras.resized(max(1, round(fraction * width)), max(1, round(fraction * height)))
+
+
+def pool_to_cells(pixels: Tensor, camera: Cameras) -> Tensor:
+    """Return the means (K, h, w) of ``pixels`` (H, W, K) over the cells of ``camera``, on the CPU."""
+    size = (camera.height, camera.width)
+    return adaptive_avg_pool2d(pixels.cpu().permute(2, 0, 1), size)
 
 
 def unproject_pixels(camera: Cameras, which: Tensor, depth: Tensor) -> Tensor:

@@ -22,7 +22,6 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import adaptive_avg_pool2d
 
 from dyngs.core.camera import Cameras
 from dyngs.core.state import strip_roles
@@ -37,6 +36,7 @@ from dyngs.ops.adam import Count
 from dyngs.training.corrections.cells import (
     camera_distances,
     cell_camera,
+    pool_to_cells,
     project_to_pixels,
     unproject_pixels,
 )
@@ -199,8 +199,7 @@ def _view_cells(
     bad = (rgb >= SATURATED).any(-1)
     bad = bad if image.alpha is None else bad | (image.alpha < OPAQUE)
     bad = bad if image.mask is None else bad | (image.mask < 1)
-    pixels = torch.cat([rgb, bad[..., None].float()], -1).permute(2, 0, 1).cpu()
-    pooled = adaptive_avg_pool2d(pixels, (camera.height, camera.width)).flatten(1)
+    pooled = pool_to_cells(torch.cat([rgb, bad[..., None].float()], -1), camera).flatten(1)
     colours = pooled[:3].T
     known = (pooled[3] == 0) & (colours > DARKEST).all(1)
     known &= drawn.alpha[0].flatten().cpu() > OPAQUE

@@ -16,7 +16,7 @@ from dataclasses import replace
 
 import torch
 from torch import Tensor
-from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d, max_pool2d
+from torch.nn.functional import avg_pool2d, max_pool2d
 
 from dyngs.core.camera import Cameras
 from dyngs.core.tensor_checks import require_indices, require_tensor
@@ -26,6 +26,7 @@ from dyngs.training.corrections.cells import (
     CELLS,
     camera_distances,
     cell_camera,
+    pool_to_cells,
     project_to_pixels,
     unproject_pixels,
 )
@@ -102,8 +103,7 @@ class RobustMasks(Correction):
         """Return (h, w) bool, the cells of a view that are excluded from the loss."""
         index = view.index
         background = view.background.cpu()
-        size = (camera.height, camera.width)
-        drawn = adaptive_avg_pool2d(view.rendered.detach().cpu().permute(2, 0, 1), size)
+        drawn = pool_to_cells(view.rendered.detach(), camera)
         seen, keeps = self._others.cells_of(index, background)
         error = (drawn - seen).abs().mean(0)
         residual = _mean_3x3(error * keeps)
@@ -219,7 +219,6 @@ class NeighbourViews:
             rgb = image.rgb_premultiplied
             ones = torch.ones_like(rgb[..., 0])
             maps = [ones if x is None else x for x in (image.alpha, image.mask)]
-            pixels = torch.cat([rgb, torch.stack(maps, -1)], -1).permute(2, 0, 1).cpu()
-            camera = self._cameras[index]
-            self._cells[index] = adaptive_avg_pool2d(pixels, (camera.height, camera.width))
+            pixels = torch.cat([rgb, torch.stack(maps, -1)], -1)
+            self._cells[index] = pool_to_cells(pixels, self._cameras[index])
         return self._cells[index]
