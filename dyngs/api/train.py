@@ -263,7 +263,11 @@ class _Run:
                 self._count = CountLimit(plan.max_gaussians, plan.seconds)
                 editors.append(self._count)
             if trainer.num_gaussians:
-                _show_memory(trainer, processes.local_size)
+                for forecast in memory_forecasts(trainer, processes.local_size):
+                    log_info(str(forecast))
+                    warning = forecast.warning()
+                    if warning is not None:
+                        log_warning(warning)
         self._leader = Leader(processes, config, _num_threads(config, processes))
         self.loop = Loop(
             trainer,
@@ -420,15 +424,6 @@ class _Run:
         megabytes = self.config.budget.max_mb
         if isinstance(trainer, Trainer) and megabytes is not None:
             yield str(write_limited_file(trainer, self.folder, megabytes))
-
-
-def _show_memory(trainer: Trainer[Any], processes: int) -> None:
-    """Show how much memory a run will take, and warn where that is likely to be too much."""
-    for forecast in memory_forecasts(trainer, processes):
-        log_info(str(forecast))
-        warning = forecast.warning()
-        if warning is not None:
-            log_warning(warning)
 
 
 def _num_threads(config: Config, processes: Processes) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Sequence, Sized
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from statistics import fmean, median
@@ -21,7 +21,6 @@ from dyngs.evaluate.report import load_split_images
 from dyngs.evaluate.view_scores import Regions, SceneRenderer, score_views, time_renders
 from dyngs.io.write import write_image
 from dyngs.models.checkpoint import read_run_capture
-from dyngs.models.renderable import Renderable
 from dyngs.models.views import evaluation_background
 from dyngs.ops.device import select_device
 from dyngs.ops.native import kernel_threads, num_cores
@@ -147,6 +146,7 @@ class SceneMeasurer:
             rendered = drawing.image(image.cameras, image.time)
             write_image(images / study_scene.slug / file, rendered.cpu().numpy())
             views.append((image.name, scores[i].psnr))
+        count = len(drawing.scene) if isinstance(drawing.scene, Sized) else 0
         mb = 1e-6 * num_bytes_exact(drawing.scene)
         if has_only_scene_file(folder):
             mb = 1e-6 * (folder / SCENE_FILE).stat().st_size
@@ -155,7 +155,7 @@ class SceneMeasurer:
             name=study_scene.name,
             num_views=len(loader),
             **means,
-            gaussians=_count(drawing.scene),
+            gaussians=count,
             mb=mb,
             steps=run.step,
             seconds=run.seconds_train,
@@ -206,8 +206,3 @@ class SceneMeasurer:
                     found[i] = replace(found[i], ms=1e3 * median(own.tolist()), gain=gain)
                     write_stored(self.measurement_path(study_scenes[i].slug), asdict(found[i]))
         return found
-
-
-def _count(scene: Renderable) -> int:
-    """Return the number of Gaussians or triangles, or 0 for other scenes."""
-    return len(scene) if hasattr(scene, "__len__") else 0  # type: ignore[arg-type]

@@ -88,9 +88,9 @@ def memory_forecasts(trainer: Trainer[Any], processes: int = 1) -> list[MemoryFo
     """
     images = trainer.images
     config = trainer.config
-    pixels = max((width * height for width, height in images.sizes), default=0)
-    side = max((max(size) for size in images.sizes), default=0)
-    files = max((view.width * view.height for view in images.views), default=0)
+    pixels = max(width * height for width, height in images.sizes)
+    side = max(map(max, images.sizes))
+    files = max(view.width * view.height for view in images.views)
     decoded = images.pending_bytes + (images.num_prefetched // 2 or 1) * DECODING * files
     count = expected_gaussians(config, trainer.num_gaussians, side)
     # trained values per Gaussian, without those of a deformation field
