@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -42,7 +42,6 @@ def predict(
     views: int | tuple[str, ...] | None = None,
     *,
     steps: int | None = None,
-    log: Callable[[str], None] = log_info,
     report: ProgressCallback = ignore_progress,
 ) -> Prediction:
     """Write the person of ``capture`` as a run folder ``out`` for all commands; ``dyngs train
@@ -57,8 +56,7 @@ def predict(
             network is for.
         steps: of training the network on these images before; None: as many as usual for such a
             network.
-        say: is told in a line of what takes long before.
-        report: is told how far that and these steps have come.
+        report: called with the progress of these steps and of what takes long before.
 
     Raises:
         DyngsError: not such a run or capture, views that are not there or do not suit, or an
@@ -70,7 +68,7 @@ def predict(
     require_empty(out)  # before the work
     data = config.data.model_copy(update={"root": capture.absolute()})
     network_kind = require_network(config, network)
-    predictor = network_kind.networks()[1](config, checkpoint, data, log, report)
+    predictor = network_kind.networks()[1](config, checkpoint, data, log_info, report)
     chosen = _chosen(predictor, network_kind.num_views(config.model) if views is None else views)
     began = time.perf_counter()
     done = predictor.adapt(chosen, steps, report)
