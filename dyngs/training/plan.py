@@ -74,23 +74,17 @@ def extend_config(config: Config, done: int, steps: int) -> Config:
         raise DyngsError(
             f"train.steps={steps}: the run already has {format_count(done, 'step')}; use a larger number"
         )
-    _require_exposures_stay(config, length)
+    begun, begins = (round(WARM_UP * steps) for steps in (length.was, steps))
+    if config.train.exposure == "always" and begun < done <= begins:
+        raise DyngsError(
+            f"train.steps={steps}: exposures were learned from step {begun:,} on, but a run of "
+            f"{steps:,} steps learns them from step {begins:,} on; train a new run of that length"
+        )
     changed: dict[str, object] = {"train": _train(config.train, length)}
     extends = capability(config.model, HasSchedules)
     if extends is not None:
         changed["model"] = extends.extend_schedules(config.model, length)
     return config.model_copy(update=changed)
-
-
-def _require_exposures_stay(config: Config, length: LengthChange) -> None:
-    begun, begins = (round(WARM_UP * steps) for steps in (length.was, length.steps))
-    if config.train.exposure == "always" and begun < length.done <= begins:
-        raise DyngsError(
-            f"train.steps={length.steps}: exposures were learned from step {begun:,} on, but a run "
-            "of "
-            f"{length.steps:,} steps learns them from step {begins:,} on; train a new run of that "
-            "length"
-        )
 
 
 def _train(options: TrainConfig, length: LengthChange) -> TrainConfig:
