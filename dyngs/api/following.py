@@ -23,8 +23,8 @@ from dyngs.training.trainer import Trainer
 
 STEP = "step"
 Command = Config | Checkpoint | str | None
-"""Command from rank 0 to the other ranks: build the trainer of a config, restore a checkpoint, train
-for one ``STEP``, or end (None)."""
+"""Command from rank 0 to the other ranks: build the trainer of a config, restore a checkpoint,
+train for one ``STEP``, or end (None)."""
 
 
 class Leader:

@@ -25,7 +25,7 @@ def cell_camera(cameras: Cameras) -> Cameras:
 
 
 def pool_to_cells(pixels: Tensor, camera: Cameras) -> Tensor:
-    """Return the means (K, h, w) of ``pixels`` (H, W, K) over the cells of ``camera``, on the CPU."""
+    """Return the means (K, h, w) of ``pixels`` (H, W, K) over cells of ``camera``, on the CPU."""
     size = (camera.height, camera.width)
     return adaptive_avg_pool2d(pixels.cpu().permute(2, 0, 1), size)
 

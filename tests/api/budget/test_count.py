@@ -1,4 +1,4 @@
-"""The number of Gaussians at the end is never exceeded, wherever a run begins, also when resumed."""
+"""The limit on the final number of Gaussians is kept, wherever a run begins, also when resumed."""
 
 from __future__ import annotations
 
