@@ -17,10 +17,9 @@ before.
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-import torch
 from torch import Tensor
 
 from dyngs.compress.measure import find_coarsest_file
@@ -35,12 +34,10 @@ from dyngs.config import AutoColour, Config
 from dyngs.core.errors import DyngsError, format_count
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.times import evenly_spaced
-from dyngs.gaussians.colour.training import HELD_OUT_EVERY, MeasuredView, find_view_dependent
+from dyngs.gaussians.colour.training import HELD_OUT_EVERY
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.renderable import Posable
-from dyngs.models.views import background_colour
-from dyngs.ops.device import copy_async
 from dyngs.training.new_trainer import GaussianTrainer
 from dyngs.training.trainer import TrainingEdit
 
@@ -84,26 +81,7 @@ def _drop_harmonics(trainer: GaussianTrainer, tolerance: float) -> None:
     usable = [i for i in range(len(trainer.images)) if i not in trainer.held_out]
     judged = usable[HELD_OUT_EVERY // 2 :: HELD_OUT_EVERY] or usable[:1]
     seen = [i for i in usable if i not in judged] or judged
-    background = copy_async(background_colour(trainer.background), trainer.device)
-    looks = list(_looks(trainer, judged, background))
-    found = find_view_dependent(
-        _looks(trainer, seen, background), looks, trainer.model.options, background, tolerance
-    )
-    trainer.model.drop_harmonics(~found.kept_harmonics, found.offsets)
-    trainer.model.freeze_plain_harmonics(
-        ~found.kept_harmonics, AutoColour(opacity_entropy=trainer.config.colour.opacity_entropy)
-    )
-
-
-def _looks(
-    trainer: GaussianTrainer, indices: Sequence[int], background: Tensor
-) -> Iterator[MeasuredView]:
-    for image in (trainer.images[i] for i in indices):
-        with torch.no_grad():
-            now = trainer.model.training.time_step(
-                trainer.model.scene, image, trainer.done
-            ).gaussians.detach()
-        yield MeasuredView(now, image.cameras, image.composite(background), image.mask)
+    trainer.model.drop_harmonics(seen, judged, trainer.done, tolerance)
 
 
 HELD_OUT_FRACTION = 1 / 8

@@ -9,7 +9,7 @@ from typing import Any, Generic, TypeVar, cast
 import torch
 from torch import Tensor
 
-from dyngs.config import AutoColour, DefaultStrategy, SceneInit, SceneModel
+from dyngs.config import DefaultStrategy, SceneInit, SceneModel
 from dyngs.core.conventions import SH_C0, RasterizeMode
 from dyngs.core.gaussians import morton_order
 from dyngs.core.state import Role, State, add_prefix, with_role
@@ -17,10 +17,10 @@ from dyngs.data.loader import Image
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import restore_colour_network
 from dyngs.gaussians.colour.training import (
-    AutoTraining,
     ColourTraining,
     MeasuredView,
-    MeasurementViews,
+    ViewDependence,
+    find_view_dependent,
 )
 from dyngs.gaussians.densify import Densifier
 from dyngs.gaussians.optimizer import FrozenMask, GaussianOptimizer
@@ -181,11 +181,7 @@ class GaussianModel(Model[GaussianScene]):
     @property
     def leaves(self) -> Sequence[Tensor]:
         leaves = [*self._optimizer.parameters.tensors().values()]
-        leaves += (
-            []
-            if self.colours.network_parameters is None
-            else self.colours.network_parameters.leaves
-        )
+        leaves += [] if self.colours.parameters is None else self.colours.parameters.leaves
         return [*leaves, *self.training.leaves(self._scene)]
 
     def draw(
@@ -243,7 +239,7 @@ class GaussianModel(Model[GaussianScene]):
         generator = self._generator
         progress = self._rate_schedule.progress(step, since=self.training.means_decay_from)
         lr_means = means_rate(self._rates, progress, self._run.extent)
-        frozen = self.colours.frozen_harmonics()
+        frozen = self.colours.frozen_harmonics
         skip_unseen_rows = self.training.skip_unseen_rows(self._scene)
         frozen_mask = self.training.frozen_mask()
         self.densifier.add_time_gradient(step, self.training.time_gradient(self._scene))
@@ -303,18 +299,27 @@ class GaussianModel(Model[GaussianScene]):
         """Stop densification and pruning."""
         self.densifier = Densifier()
 
-    def drop_harmonics(self, dropped: Tensor, offsets: Tensor) -> None:
-        """Replace the SH of the Gaussians ``dropped`` (N,) by their base colour plus ``offsets``
-        (N, 3)."""
-        base = self._scene.gaussians.sh.detach()[:, 0] + offsets / SH_C0
-        self._optimizer.drop_harmonics(base, dropped)
-        self.replace_scene(self._scene)
+    def drop_harmonics(
+        self, seen: Sequence[int], held_out: Sequence[int], step: int, tolerance: float
+    ) -> ViewDependence:
+        """Drop SH of Gaussians that do not improve the training views ``held_out``, for good.
 
-    def freeze_plain_harmonics(self, plain: Tensor, colour: AutoColour) -> None:
-        """Keep the SH above degree 0 of the Gaussians ``plain`` (N,) at zero from now on."""
-        colours = AutoTraining(colour, self._config.train.steps, len(self._run.images))
-        colours.freeze(plain)
-        self.colours = colours
+        See ``find_view_dependent``. ``seen``: training views that colours are measured on.
+        """
+        colour = background_colour(self._run.background).to(self._scene.device)
+
+        def views(indices: Sequence[int]) -> Iterator[MeasuredView]:
+            for image in (self._run.images[i] for i in indices):
+                gaussians = self.training.time_step(self._scene, image, step).gaussians.detach()
+                yield MeasuredView(gaussians, image.cameras, image.composite(colour), image.mask)
+
+        options = self._options(step)
+        found = find_view_dependent(views(seen), list(views(held_out)), options, colour, tolerance)
+        base = self._scene.gaussians.sh.detach()[:, 0] + found.offsets / SH_C0
+        self._optimizer.drop_harmonics(base, ~found.kept_harmonics)
+        self.colours.freeze(~found.kept_harmonics)
+        self.replace_scene(self._scene)
+        return found
 
     def set_render_options(self, model: SceneModel) -> None:
         """Use the render options of another config section of the same kind."""
@@ -389,27 +394,16 @@ class GaussianModel(Model[GaussianScene]):
 
     def _measure_harmonics(self, step: int) -> str | None:
         """Drop SH that do not improve held-out views if due at this step; return a message."""
-        if not self._scene.gaussians.sh_degree:
+        colours = self.colours
+        if step != colours.measurement_step or not self._scene.gaussians.sh_degree:
             return None
-        result = self.colours.measure_harmonics(step, lambda: self._measurement_views(step))
-        if result is None:
+        times = enumerate(self._run.images.times)
+        may_train = [i for i, time in times if self.training.trains_on(time, step)]
+        seen = [i for i in may_train if i not in colours.held_out]
+        held_out = [i for i in may_train if i in colours.held_out]
+        if not seen or not held_out:
             return None
-        self.drop_harmonics(~result.kept_harmonics, result.offsets)
-        return str(result)
-
-    def _measurement_views(self, step: int) -> MeasurementViews:
-        images = self._run.images
-        colour = background_colour(self._run.background).to(self._scene.device)
-
-        def views(indices: Sequence[int]) -> Iterator[MeasuredView]:
-            for image in (images[i] for i in indices):
-                gaussians = self.training.time_step(self._scene, image, step).gaussians.detach()
-                yield MeasuredView(gaussians, image.cameras, image.composite(colour), image.mask)
-
-        may_train = [
-            i for i, time in enumerate(images.times) if self.training.trains_on(time, step)
-        ]
-        return MeasurementViews(may_train, views, self._options(step), colour)
+        return str(self.drop_harmonics(seen, held_out, step, colours.tolerance))
 
     def _render_options(self, model: SceneModel) -> RenderOptions:
         return render_options(model, self._run.extent, self._run.capture.world_scale)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -177,19 +177,21 @@ HELD_OUT_EVERY = 8
 _HELD_OUT = 5  # index of the held-out view among each eight
 
 
-@dataclass(frozen=True)
-class MeasurementViews:
-    """Training views that ``measure_harmonics`` renders at the current step."""
-
-    indices: Sequence[int]  # training views inside the time window
-    # yields the views with these indices, one at a time
-    views: Callable[[Sequence[int]], Iterator[MeasuredView]]
-    options: RenderOptions
-    background: Tensor
-
-
 class ColourTraining:
-    """Training of plain SH colours; base class of the other colour models."""
+    """Training of plain SH colours; base class of the other colour models.
+
+    Attributes:
+        parameters: of the colour network; None without one.
+        measurement_step: step after which SH that do not improve the views ``held_out`` are
+            dropped, see ``find_view_dependent``; 0: never.
+        frozen_harmonics: (N,) bool, Gaussians whose SH above degree 0 stay zero; None: no Gaussian.
+    """
+
+    parameters: Parameters | None = None
+    measurement_step = 0
+    held_out: Sequence[int] = ()
+    tolerance = 0.0
+    frozen_harmonics: Tensor | None = None
 
     def __init__(self, options: ColourSection) -> None:
         self.entropy_weight = options.opacity_entropy
@@ -199,10 +201,6 @@ class ColourTraining:
         """Colour network, or None if SH coefficients give the colours."""
         return None
 
-    @property
-    def network_parameters(self) -> Parameters | None:
-        return None
-
     def penalties(self, gaussians: Gaussians) -> dict[str, Tensor]:
         if self.entropy_weight == 0:
             return {}
@@ -210,20 +208,16 @@ class ColourTraining:
 
     def is_held_out(self, index: int, step: int) -> bool:
         """Return whether training view ``index`` is held out at ``step``."""
-        return False
+        return step <= self.measurement_step and index in self.held_out
 
-    def measure_harmonics(
-        self, step: int, get_views: Callable[[], MeasurementViews]
-    ) -> ViewDependence | None:
-        """Select the Gaussians that keep SH if ``step`` is the step for it; None otherwise."""
-        return None
-
-    def frozen_harmonics(self) -> Tensor | None:
-        """Return (N,) bool, Gaussians whose SH above degree 0 stay zero; None: no Gaussian."""
-        return None
+    def freeze(self, frozen: Tensor) -> None:
+        """Keep the SH above degree 0 of the Gaussians ``frozen`` (N,) at zero from now on."""
+        self.frozen_harmonics = None if bool(frozen.all()) else frozen
 
     def apply_edit(self, edit: TopologyEdit) -> None:
         """Update per-Gaussian state after a topology edit."""
+        if self.frozen_harmonics is not None:
+            self.frozen_harmonics = edit.apply(self.frozen_harmonics)
 
     def optimize(self, step: int) -> Count:
         """Update the colour parameters in place; return the number of skipped rows (bad
@@ -232,16 +226,25 @@ class ColourTraining:
 
     def move_to(self, device: torch.device) -> None:
         """Move the state to ``device``."""
+        if self.frozen_harmonics is not None:
+            self.frozen_harmonics = self.frozen_harmonics.to(device)
 
     def state(self) -> State:
-        return {}
+        frozen = self.frozen_harmonics
+        return {} if frozen is None else {"frozen": StateTensor(frozen, Role.TRAINING)}
 
     def restore(self, tensors: Mapping[str, Tensor], count: int) -> None:
         """Restore the state for N = ``count`` Gaussians."""
+        frozen = tensors.get("frozen")
+        if frozen is not None:
+            require_tensor("frozen", frozen, (count,), torch.bool)
+        self.frozen_harmonics = frozen
 
 
 class NetworkTraining(ColourTraining):
     """A colour network shared by all Gaussians, trained with Adam."""
+
+    parameters: Parameters
 
     def __init__(
         self,
@@ -266,10 +269,6 @@ class NetworkTraining(ColourTraining):
         )
         return ColourNetwork(tuple(layers), self.box, self.uses_time, self.options.normals)
 
-    @property
-    def network_parameters(self) -> Parameters:
-        return self.parameters
-
     def optimize(self, step: int) -> Count:
         return self.parameters.update(step, rate_factor(step, self.steps))
 
@@ -291,52 +290,7 @@ class AutoTraining(ColourTraining):
         super().__init__(options)
         self.tolerance = options.tolerance
         self.measurement_step = options.measurement_step(steps)
-        self.held_out = tuple(range(_HELD_OUT, num_views, HELD_OUT_EVERY))
-        self._frozen: Tensor | None = None
-
-    def is_held_out(self, index: int, step: int) -> bool:
-        """Return true for every eighth view until ``measure_harmonics`` has used them."""
-        return step <= self.measurement_step and index in self.held_out
-
-    def measure_harmonics(
-        self, step: int, get_views: Callable[[], MeasurementViews]
-    ) -> ViewDependence | None:
-        if step != self.measurement_step or not self.held_out:
-            return None
-        views = get_views()
-        seen = [i for i in views.indices if i not in self.held_out]
-        held_out = [i for i in views.indices if i in self.held_out]
-        if not seen or not held_out:
-            return None
-        judged = list(views.views(held_out))
-        found = find_view_dependent(
-            views.views(seen), judged, views.options, views.background, self.tolerance
-        )
-        self.freeze(~found.kept_harmonics)
-        return found
-
-    def freeze(self, frozen: Tensor) -> None:
-        """Keep the SH above degree 0 of the Gaussians ``frozen`` (N,) at zero from now on."""
-        self._frozen = None if bool(frozen.all()) else frozen
-
-    def frozen_harmonics(self) -> Tensor | None:
-        return self._frozen
-
-    def apply_edit(self, edit: TopologyEdit) -> None:
-        if self._frozen is not None:
-            self._frozen = edit.apply(self._frozen)
-
-    def move_to(self, device: torch.device) -> None:
-        self._frozen = None if self._frozen is None else self._frozen.to(device)
-
-    def state(self) -> State:
-        return {} if self._frozen is None else {"frozen": StateTensor(self._frozen, Role.TRAINING)}
-
-    def restore(self, tensors: Mapping[str, Tensor], count: int) -> None:
-        frozen = tensors.get("frozen")
-        self._frozen = (
-            None if frozen is None else require_tensor("frozen", frozen, (count,), torch.bool)
-        )
+        self.held_out = range(_HELD_OUT, num_views, HELD_OUT_EVERY)
 
 
 def opacity_entropy(logits: Tensor) -> Tensor:

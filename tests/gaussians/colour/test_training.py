@@ -91,19 +91,19 @@ def test_resume_equals_uninterrupted_training() -> None:
 
 def test_frozen_masks_follow_edits_and_are_restored() -> None:
     colours = AutoTraining(AutoColour(), 100, 20)
-    assert colours.frozen_harmonics() is None
+    assert colours.frozen_harmonics is None
     colours.freeze(torch.tensor([True, False, True]))
     colours.apply_edit(TopologyEdit(torch.tensor([1, 2, 2]), torch.tensor([False, False, True])))
-    assert colours.frozen_harmonics() is not None
+    assert colours.frozen_harmonics is not None
     other = AutoTraining(AutoColour(), 100, 20)
     other.restore(strip_roles(colours.state()), 3)
-    frozen = other.frozen_harmonics()
+    frozen = other.frozen_harmonics
     assert frozen is not None
     assert frozen.tolist() == [False, True, True]
     with pytest.raises(ValueError, match="frozen"):
         other.restore(strip_roles(colours.state()), 4)
     colours.freeze(torch.ones(3, dtype=torch.bool))
-    assert colours.frozen_harmonics() is None, (
+    assert colours.frozen_harmonics is None, (
         "where no harmonics are stored none need to be kept at zero"
     )
 
@@ -190,14 +190,14 @@ def test_harmonics_without_gain_are_dropped(seven_views: Path, name: str) -> Non
         counts.add(len(trainer.model.scene.gaussians))
         if report.message is not None:
             messages[step] = report.message
-            dropped = trainer.model.colours.frozen_harmonics()
+            dropped = trainer.model.colours.frozen_harmonics
         if step <= MEASURED_AFTER:
             seen.add(report.image.name)
     assert len(seen) == 6
     assert list(messages) == [MEASURED_AFTER]
     assert len(counts) > 4
     sh = trainer.model.scene.gaussians.sh
-    frozen = trainer.model.colours.frozen_harmonics()
+    frozen = trainer.model.colours.frozen_harmonics
     if name == "none pays":
         assert "view-dependent colour removed" in messages[MEASURED_AFTER]
         assert sh.shape[1] == 1
