@@ -4,20 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from dyngs.core.camera import Cameras
 from dyngs.core.state import Role, State, StateTensor
 from dyngs.core.tensor_checks import require_indices, require_tensor
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.filters import apply_filter, filter_state, restore_filter
-from dyngs.gaussians.rendering import GaussianRendering, RenderOptions
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep, restore_times, times_state
-from dyngs.models.renderable import TimeStep, clamp_time, concatenate_renderings, single_views
+from dyngs.models.renderable import clamp_time
 
 _UNSEEN = -30.0  # logit of an opacity that is never drawn
 
@@ -40,9 +39,9 @@ class ViewSides:
         directions = normalize(torch.stack([*viewpoints]) - center, dim=1)
         return ViewSides(side_ids.repeat_interleave(sizes), directions, center)
 
-    def visible_from(self, camera: Cameras, gaussians: Gaussians) -> Gaussians:
-        """Hide the Gaussians of all viewing directions but the one nearest to the camera."""
-        side = (self.directions @ normalize(camera.centers[0] - self.center, dim=0)).argmax()
+    def visible_from(self, gaussians: Gaussians, eye: Tensor) -> Gaussians:
+        """Hide the Gaussians of all viewing directions but the one nearest to ``eye`` (3,)."""
+        side = (self.directions @ normalize(eye.to(self.center) - self.center, dim=0)).argmax()
         return gaussians.replace(
             logit_opacities=gaussians.logit_opacities.where(self.side_ids == side, _UNSEEN)
         )
@@ -111,33 +110,9 @@ class StaticScene(GaussianScene):
 
     def time_step(self, time: float | None) -> GaussianTimeStep:
         """Return the Gaussians with their 3D filter applied."""
-        return GaussianTimeStep(apply_filter(self.gaussians, self.filter_std), clamp_time(time))
-
-    def render(
-        self,
-        cameras: Cameras,
-        time: float | TimeStep | None = None,
-        *,
-        options: RenderOptions | None = None,
-        background: Tensor | None = None,
-        probe: Tensor | None = None,
-    ) -> GaussianRendering:
-        if self.sides is None:
-            return super().render(
-                cameras, time, options=options, background=background, probe=probe
-            )
-        now = time if isinstance(time, GaussianTimeStep) else self.time_step(None)
-        cameras = cameras.to(device=self.device, dtype=now.gaussians.means.dtype)
-        renderings = []
-        for i, (camera, behind) in enumerate(
-            single_views(cameras, self.background if background is None else background)
-        ):
-            own = GaussianTimeStep(self.sides.visible_from(camera, now.gaussians), now.time)
-            signal = None if probe is None else probe[i : i + 1]
-            renderings.append(
-                super().render(camera, own, options=options, background=behind, probe=signal)
-            )
-        return concatenate_renderings(renderings)
+        gaussians = apply_filter(self.gaussians, self.filter_std)
+        from_eye = None if self.sides is None else partial(self.sides.visible_from, gaussians)
+        return GaussianTimeStep(gaussians, clamp_time(time), from_eye=from_eye)
 
     def apply_edit(self, edit: TopologyEdit) -> StaticScene:
         std = None if self.filter_std is None else edit.apply(self.filter_std)
