@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from dyngs.core.initialisation import glorot
+from dyngs.core.initialisation import glorot_layers
 from dyngs.core.state import State, add_prefix, move_to_device, select_prefix
 from dyngs.deform.keys import FieldSection
 from dyngs.gaussians import Gaussians, TopologyEdit
@@ -359,23 +359,17 @@ class Decoder:
 
     def start_values(self, generator: torch.Generator) -> dict[str, Tensor]:
         """Return Glorot weights (Glorot and Bengio 2010), zero biases and a zero last layer."""
-        values: dict[str, Tensor] = {}
-        last = len(self.widths) - 2
-        for i in range(last + 1):
-            fan_in = self.widths[i] + (self.widths[0] if i == self.skip else 0)
-            if i == last and self.separate_heads:
-                fan_in //= len(self.separate_heads)
-            fan_out = self.widths[i + 1]
-            weight = glorot(fan_in, fan_out, generator)
-            values[f"weight{i}"] = torch.zeros_like(weight) if i == last else weight
-            values[f"bias{i}"] = torch.zeros(fan_out, device="cpu")
+        *inputs, _ = self.widths
+        if self.skip is not None:
+            inputs[self.skip] += self.widths[0]
+        if self.separate_heads:
+            inputs[-1] //= len(self.separate_heads)
+        values = glorot_layers(zip(inputs, self.widths[1:], strict=True), generator)
+        values[f"weight{len(inputs) - 1}"].zero_()
         return values
 
     def __call__(self, features: Tensor, parameters: Parameters) -> Tensor:
-        layers = [
-            Layer(parameters[f"weight{i}"], parameters[f"bias{i}"])
-            for i in range(len(self.widths) - 1)
-        ]
+        layers = parameters.layers(len(self.widths) - 1)
         if self.separate_heads:
             *others, last = layers
             weight = torch.block_diag(*last.weight.split(self.separate_heads))

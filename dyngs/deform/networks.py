@@ -8,7 +8,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from dyngs.core.initialisation import glorot
+from dyngs.core.initialisation import glorot_layers
 from dyngs.deform.field import (
     MAX_KEY_TIMES,
     Decoder,
@@ -21,7 +21,7 @@ from dyngs.deform.field import (
 )
 from dyngs.deform.keys import HexplaneField, MlpField
 from dyngs.gaussians.optimizer import Parameters
-from dyngs.ops.perceptron import Layer, perceptron
+from dyngs.ops.perceptron import perceptron
 from dyngs.ops.planes import PlaneLevel, hexplane_features, plane_penalty
 
 SPACE_RANGE = (0.1, 0.5)
@@ -111,9 +111,7 @@ class Mlp(DeformationField):
         weights = self.decoder.start_values(generator)
         if options.time_features:
             widths = [encoded_time, options.width, options.time_features]
-            for i, (fan_in, fan_out) in enumerate(pairwise(widths)):
-                weights[f"time_weight{i}"] = glorot(fan_in, fan_out, generator)
-                weights[f"time_bias{i}"] = torch.zeros(fan_out, device="cpu")
+            weights |= glorot_layers(pairwise(widths), generator, "time_")
         self.parameters = Parameters(weights, dict.fromkeys(weights, options.lr), MLP_LR_DECAY)
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
@@ -124,11 +122,7 @@ class Mlp(DeformationField):
             space.new_full((1, 1), time), self.options.time_frequencies
         )
         if self.options.time_features:
-            layers = [
-                Layer(self.parameters[f"time_weight{i}"], self.parameters[f"time_bias{i}"])
-                for i in range(2)
-            ]
-            encoded_time = perceptron(encoded_time, layers)
+            encoded_time = perceptron(encoded_time, self.parameters.layers(2, "time_"))
         features = torch.cat([space, encoded_time.expand(len(space), -1)], dim=1)
         return split_heads(self.decoder(features, self.parameters), self.options)
 

@@ -12,10 +12,10 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from dyngs.core.initialisation import glorot
+from dyngs.core.initialisation import glorot_layers
 from dyngs.deform.networks import encode_frequencies
 from dyngs.gaussians.optimizer import Parameters
-from dyngs.ops.perceptron import Layer, perceptron
+from dyngs.ops.perceptron import perceptron
 
 OCTAVES = 6  # of all encodings; 39 numbers of a direction and 13 of a time, as in a figure
 BRANCHES = {"means": 4, "directions": 3, "times": 1}  # inputs before their encoding
@@ -31,9 +31,7 @@ def start_values(width: int, generator: torch.Generator) -> dict[str, Tensor]:
     widths["joined"] = [FEATURES * len(BRANCHES), width, width, NUM_FACTORS]
     values: dict[str, Tensor] = {}
     for name, sizes in widths.items():
-        for i, (fan_in, fan_out) in enumerate(pairwise(sizes)):
-            values[f"{name}_weight{i}"] = glorot(fan_in, fan_out, generator)
-            values[f"{name}_bias{i}"] = torch.zeros(fan_out, device="cpu")
+        values |= glorot_layers(pairwise(sizes), generator, f"{name}_")
     values["joined_weight2"].zero_()
     return values
 
@@ -53,11 +51,7 @@ def predict_changes(
     """
 
     def evaluate(name: str, x: Tensor, num_layers: int = 2) -> Tensor:
-        layers = [
-            Layer(parameters[f"{name}_weight{i}"], parameters[f"{name}_bias{i}"])
-            for i in range(num_layers)
-        ]
-        return perceptron(x, layers).expand(len(means), -1)
+        return perceptron(x, parameters.layers(num_layers, f"{name}_")).expand(len(means), -1)
 
     view = means[:1] if directions is None else directions
     inputs = torch.cat([means, 2 * times - 1], dim=1), view, 2 * now - 1

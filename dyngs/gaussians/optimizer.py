@@ -13,6 +13,7 @@ from dyngs.core.state import Role, State, StateTensor, add_prefix, move_to_devic
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.ops.adam import AdamUpdate, Count, adam_steps_, seen_rows
+from dyngs.ops.perceptron import Layer
 
 MOMENTS = "exp_avg", "exp_avg_sq"
 """Prefixes of the moments in a state dict."""
@@ -161,6 +162,10 @@ class Parameters:
 
     def __contains__(self, name: str) -> bool:
         return name in self._tensors
+
+    def layers(self, count: int, prefix: str = "") -> list[Layer]:
+        """Return the layers of a network whose weights and biases have this ``prefix``."""
+        return [Layer(self[f"{prefix}weight{i}"], self[f"{prefix}bias{i}"]) for i in range(count)]
 
     @property
     def leaves(self) -> list[Tensor]:

@@ -14,7 +14,7 @@ from torch.nn.functional import logsigmoid
 from dyngs.config import AutoColour, ColourSection, NetworkColour
 from dyngs.core.camera import Cameras
 from dyngs.core.conventions import SH_C0
-from dyngs.core.initialisation import glorot
+from dyngs.core.initialisation import glorot_layers
 from dyngs.core.state import Role, State, StateTensor
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.gaussians import Gaussians, TopologyEdit
@@ -23,7 +23,6 @@ from dyngs.gaussians.optimizer import Parameters
 from dyngs.gaussians.rendering import RenderOptions, contributions, render
 from dyngs.ops.adam import Count
 from dyngs.ops.harmonics import evaluate_harmonics
-from dyngs.ops.perceptron import Layer
 from dyngs.ops.shading import num_inputs
 
 _CLAMP_OFFSET = 64.0  # offset that keeps colours above the clamp at 0; float32 still resolves 4e-6
@@ -258,15 +257,14 @@ class NetworkTraining(ColourTraining):
         super().__init__(options)
         self.options, self.steps, self.box, self.uses_time = options, steps, box, uses_time
         inputs = num_inputs(uses_time=uses_time, uses_normals=options.normals)
-        values = _start_values([inputs, *[options.width] * options.depth, 3], generator)
+        widths = [inputs, *[options.width] * options.depth, 3]
+        values = glorot_layers(pairwise(widths), generator)
+        values[f"weight{options.depth}"].zero_()  # so that the colours start unchanged
         self.parameters = Parameters(values, dict.fromkeys(values, options.lr))
 
     @property
     def network(self) -> ColourNetwork:
-        count = self.options.depth + 1
-        layers = (
-            Layer(self.parameters[f"weight{i}"], self.parameters[f"bias{i}"]) for i in range(count)
-        )
+        layers = self.parameters.layers(self.options.depth + 1)
         return ColourNetwork(tuple(layers), self.box, self.uses_time, self.options.normals)
 
     def optimize(self, step: int) -> Count:
@@ -309,14 +307,3 @@ def rate_factor(step: int, steps: int) -> float:
     milestone."""
     passed = sum(step > fraction * steps for fraction in _MILESTONES)
     return min(1.0, step / WARM_UP) / 3**passed
-
-
-def _start_values(widths: list[int], generator: torch.Generator) -> dict[str, Tensor]:
-    """Return Glorot weights and zero biases; the last layer is zero, so that the colours start
-    unchanged."""
-    values: dict[str, Tensor] = {}
-    for i, (fan_in, fan_out) in enumerate(pairwise(widths)):
-        weight = glorot(fan_in, fan_out, generator)
-        values[f"weight{i}"] = torch.zeros_like(weight) if i == len(widths) - 2 else weight
-        values[f"bias{i}"] = torch.zeros(fan_out, device=weight.device)
-    return values
