@@ -275,14 +275,10 @@ class DiscContrast:
     def peaks(self, index: int) -> np.ndarray:
         """Return x, y and radius in pixels (K, 3) of the discs of one image with the largest
         contrast."""
+        from scipy.ndimage import maximum_filter
+
         values = self.values[index]
-        greatest = values.copy()
-        for axis, reach in (0, 1), (1, 2), (2, 2):
-            line = np.moveaxis(greatest, axis, 0)
-            before = np.moveaxis(greatest.copy(), axis, 0)
-            for i in range(1, reach + 1):
-                np.maximum(line[i:], before[:-i], out=line[i:])
-                np.maximum(line[:-i], before[i:], out=line[:-i])
+        greatest = maximum_filter(values, (3, 5, 5))
         k, y, x = np.nonzero((values == greatest) & (values > MIN_PEAK))
         best = np.argsort(-values[k, y, x] * np.sqrt(self.radii[k]), kind="stable")[:PEAKS]
         return np.stack([x[best] + 0.5, y[best] + 0.5, self.radii[k[best]]], axis=1)
