@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 from dyngs.core.errors import DyngsError
 from dyngs.deform.keys import DynamicModel
@@ -101,7 +102,7 @@ FRONTIER_VIEWS = 6
 class TimeWindow:
     """Times that each step trains on."""
 
-    time_offsets: tuple[float, ...]
+    times: Sequence[float]
     initial_fraction: float
     motion_start: int
     window_grows_from: int
@@ -110,21 +111,10 @@ class TimeWindow:
         default_factory=dict, init=False, repr=False, compare=False
     )
 
-    @staticmethod
-    def around_middle(
-        times: Sequence[float],
-        initial_fraction: float,
-        motion_start: int,
-        window_grows_from: int,
-        window_full_at: int,
-    ) -> TimeWindow:
-        return TimeWindow(
-            tuple(sorted(abs(time - MIDDLE) for time in times)),
-            initial_fraction,
-            motion_start,
-            window_grows_from,
-            window_full_at,
-        )
+    @cached_property
+    def time_offsets(self) -> list[float]:
+        """Ascending |time - 0.5| of the training views."""
+        return sorted(abs(time - MIDDLE) for time in self.times)
 
     def num_views(self, step: int) -> int:
         start = min(

@@ -303,7 +303,7 @@ class DynamicTraining(SceneTraining[DynamicScene]):
             self.schedule.window_full_at,
         )
         self._all_times = all_times
-        self._window = TimeWindow.around_middle(self.capture.times, first, *phases)
+        self._window = TimeWindow(self.capture.times, first, *phases)
 
     def _find_bodies(self, static: Gaussians) -> Bodies | None:
         """Find rigid bodies in the images of one moving camera."""

@@ -23,7 +23,7 @@ def held(window: TimeWindow, times: list[float], step: int) -> list[float]:
 def test_window_grows_to_all_views(times: list[float], first: float) -> None:
     """For any times: unsorted, repeated, constant, at one end. Looked at in the steps that train on
     all of it."""
-    window = TimeWindow.around_middle(times, first, OPENS, OPENS, FULL)
+    window = TimeWindow(times, first, OPENS, OPENS, FULL)
     before: list[float] = []
     for step in (*ODD_STEPS, FULL, FULL + 1, 10**6):
         now = held(window, times, step)
@@ -41,7 +41,7 @@ def test_window_grows_to_all_views(times: list[float], first: float) -> None:
 @given(clips, st.floats(0, 1), st.sampled_from(EVEN_STEPS))
 def test_every_other_step_is_for_the_newest(times: list[float], first: float, step: int) -> None:
     """The newest views are the outermost ones of the window and those at the same times."""
-    window = TimeWindow.around_middle(times, first, OPENS, OPENS, FULL)
+    window = TimeWindow(times, first, OPENS, OPENS, FULL)
     newest = held(window, times, step)
     inside = sorted(
         (t for t in times if abs(t - 0.5) <= window.reach(step)), key=lambda t: abs(t - 0.5)
