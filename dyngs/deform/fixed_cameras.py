@@ -6,7 +6,7 @@ Local letters: T images of one camera.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -79,11 +79,6 @@ def build_fixed_camera_clip(
     return FixedCameraClip(
         camera, tuple(times), stack, detect_changes(stack) & valid, valid, median
     )
-
-
-def median_image(images: Sequence[Tensor]) -> Tensor:
-    """Return the median (H, W, 3) over ``images`` of a fixed camera: the static background."""
-    return torch.stack(list(images)).median(0).values
 
 
 def detect_changes(images: np.ndarray) -> np.ndarray:

@@ -13,7 +13,6 @@ from dyngs.core.camera import Cameras
 from dyngs.data.capture import View
 from dyngs.data.loader import Image
 from dyngs.data.times import evenly_spaced, static_cameras
-from dyngs.deform.fixed_cameras import median_image
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, Shader, render
 
@@ -127,7 +126,11 @@ def _median_images(images: Sequence[Image], background: Tensor) -> dict[bytes, T
     same: dict[bytes, list[Tensor]] = {}
     for image in images:
         same.setdefault(_camera_key(image), []).append(image.composite(background))
-    return {key: median_image(seen) for key, seen in same.items() if len(seen) >= MIN_SAME}
+    return {
+        key: torch.stack(seen).median(0).values
+        for key, seen in same.items()
+        if len(seen) >= MIN_SAME
+    }
 
 
 def _camera_key(image: Image) -> bytes:
