@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from dyngs.core.initialisation import glorot_layers
-from dyngs.core.state import State, add_prefix, move_to_device, select_prefix
+from dyngs.core.state import Role, State, add_prefix, move_to_device, select_prefix
 from dyngs.deform.keys import FieldSection
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.optimizer import Parameters
@@ -191,7 +191,7 @@ class DeformationField:
 
     def apply_edit(self: F, edit: TopologyEdit) -> F:
         """Return the field after a topology edit of the moving Gaussians."""
-        return self
+        return self.with_parameters(self.parameters.apply_edit(Role.PER_MOVING, edit))
 
     def invalidate(self) -> None:
         """Clear caches that depend on the set of Gaussians."""
@@ -265,12 +265,8 @@ class OuterField(DeformationField):
         self.inner_field.invalidate()
 
     def apply_edit(self: Outer, edit: TopologyEdit) -> Outer:
-        return self.with_inner(self.inner_field.apply_edit(edit))
-
-    def with_inner(self: Outer, inner_field: DeformationField) -> Outer:
-        """Return a copy of this field around another inner field."""
-        field = copy.copy(self)
-        field.inner_field = inner_field
+        field = super().apply_edit(edit)
+        field.inner_field = self.inner_field.apply_edit(edit)
         return field
 
     def to(self: Outer, device: torch.device | str) -> Outer:

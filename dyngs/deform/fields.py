@@ -31,7 +31,6 @@ from dyngs.deform.keys import (
     MlpField,
 )
 from dyngs.deform.networks import Hexplane, Mlp
-from dyngs.gaussians import TopologyEdit
 from dyngs.gaussians.optimizer import Parameters
 from dyngs.ops.adam import Count
 
@@ -71,13 +70,6 @@ class WindowedField(OuterField):
         self.edges.data[:, 0].clamp_min_(OPEN_WINDOW[0])
         self.edges.data[:, 1].clamp_max_(OPEN_WINDOW[1])
         return count
-
-    def apply_edit(self, edit: TopologyEdit) -> WindowedField:
-        return (
-            super()
-            .apply_edit(edit)
-            .with_parameters(self.parameters.apply_edit(Role.PER_MOVING, edit))
-        )
 
     def state(self) -> State:
         return self.inner_field.state() | add_prefix("windows", self.parameters.state())

@@ -86,17 +86,17 @@ class FreePrimitives(DeformationField):
     def apply_edit(self, edit: TopologyEdit) -> FreePrimitives:
         """Return the field after a topology edit; new rows are shifted in time, alternately back
         and forth."""
-        parameters = self.parameters.apply_edit(Role.PER_MOVING, edit)
+        field = super().apply_edit(edit)
         new = torch.nonzero(edit.is_new)[:, 0]
         if len(new):
             # two copies of one source get opposite signs
             ordered = new[edit.source[new].sort(stable=True).indices]
             signs = torch.ones(len(new), 1, device=new.device)
             signs[::2] = -1
-            spans = parameters["log_spans"].data[ordered].exp() + MIN_SPAN * self.gap
-            centers = parameters["centers"].data
+            spans = field.parameters["log_spans"].data[ordered].exp() + MIN_SPAN * self.gap
+            centers = field.parameters["centers"].data
             centers[ordered] = (centers[ordered] + TIME_SHIFT * spans * signs).clamp(0, 1)
-        return self.with_parameters(parameters)
+        return field
 
     def _untrained(self, centers: Tensor, spans: Tensor, velocities: Tensor) -> Parameters:
         log_spans = (spans - MIN_SPAN * self.gap).clamp_min(1e-3 * self.gap).log()

@@ -26,7 +26,7 @@ from dyngs.deform.field import (
 )
 from dyngs.deform.free import FreeInitialization
 from dyngs.deform.keys import Gaussians4DField
-from dyngs.gaussians import Gaussians, TopologyEdit
+from dyngs.gaussians import Gaussians
 from dyngs.gaussians.densify import SPLIT_SHRINK
 from dyngs.gaussians.optimizer import Parameters
 from dyngs.ops.adam import Count
@@ -256,9 +256,6 @@ class Gaussians4D(DeformationField):
             "times": times,
             "log_spans": log_spans - math.log(SPLIT_SHRINK),
         }
-
-    def apply_edit(self, edit: TopologyEdit) -> Gaussians4D:
-        return self.with_parameters(self.parameters.apply_edit(Role.PER_MOVING, edit))
 
     def _untrained(self, centers: Tensor, spans: Tensor, right_quats: Tensor) -> Parameters:
         tensors = {

@@ -169,7 +169,7 @@ class BodyField(OuterField):
     def apply_edit(self, edit: TopologyEdit) -> BodyField:
         field = super().apply_edit(edit)
         field.rest = replace(self.rest, labels=self.rest.labels[edit.source])
-        return field.with_parameters(self.parameters.apply_edit(Role.PER_MOVING, edit))
+        return field
 
     def state(self) -> State:
         rest = {name: StateTensor(x, Role.SHARED) for name, x in vars(self.rest).items()}
