@@ -16,6 +16,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -33,7 +34,7 @@ from dyngs.deform.field import (
 from dyngs.deform.keys import ControlNodesField
 from dyngs.gaussians import TopologyEdit
 from dyngs.gaussians.optimizer import Parameters
-from dyngs.ops.nodes import SPAN, cubic_fractions, node_penalties, spline_motion
+from dyngs.ops.nodes import SPAN, node_penalties, spline_motion
 from dyngs.ops.quaternions import identity_quat, rotate
 from dyngs.ops.skinning import blend_skinning
 
@@ -132,11 +133,13 @@ def _tree(points: Tensor) -> KDTree:
 def spline_basis(places: Tensor, pieces: int) -> Tensor:
     """Return weights (K, pieces + 3), float64, of a uniform cubic B-spline at ``places`` (K,) in
     [0, 1]."""
-    scaled = places.double().clamp(0, 1) * pieces
-    piece = scaled.long().clamp_max(pieces - 1)
-    weights = torch.stack(cubic_fractions(scaled - piece), dim=1)
-    basis = torch.zeros(len(places), pieces + SPAN - 1, dtype=torch.float64, device=places.device)
-    return basis.scatter_(1, piece[:, None] + torch.arange(SPAN, device=places.device), weights)
+    from scipy.interpolate import BSpline
+
+    degree = SPAN - 1
+    knots = np.arange(-degree, pieces + SPAN) / pieces
+    clamped = places.double().clamp(0, 1).cpu().numpy()
+    basis = BSpline.design_matrix(clamped, knots, degree).toarray()
+    return torch.from_numpy(basis).to(places.device)
 
 
 NO_NODES = torch.zeros(0, 3, device="cpu")
