@@ -14,7 +14,7 @@ import copy
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -38,9 +38,6 @@ from dyngs.ops.nodes import SPAN, node_penalties, spline_motion
 from dyngs.ops.quaternions import identity_quat, rotate
 from dyngs.ops.skinning import blend_skinning
 
-if TYPE_CHECKING:
-    from scipy.spatial import KDTree
-
 FOLLOWED = 4  # nodes that a Gaussian follows
 
 
@@ -61,19 +58,23 @@ class Nodes:
 
 def build_nodes(positions: Tensor, means: Tensor) -> Nodes:
     """Return nodes at ``positions`` (S, 3), S >= 1, followed by the points ``means`` (M, 3)."""
-    tree = _tree(positions)
     count = min(FOLLOWED, len(positions))
-
-    def nearest(points: Tensor, which: int) -> Tensor:
-        """Return distances (0) or indices (1) of the nearest nodes, (M, count)."""
-        numbers = points.detach().double().cpu().numpy()
-        ranks: Any = range(1, count + 1)
-        return torch.from_numpy(tree.query(numbers, k=ranks)[which])
-
-    radii = nearest(positions, 0)[:, 1:].mean(1) if count > 1 else torch.ones(1, device="cpu")
+    distances, _ = _nearest(positions, positions, count)
+    radii = distances[:, 1:].mean(1) if count > 1 else torch.ones(1, device="cpu")
     floor = max(1e-6 * float(radii.max()), 1e-12)
-    followed = nearest(means, 1).to(positions.device)
-    return Nodes(positions, radii.clamp_min(floor).to(positions), followed)
+    _, followed = _nearest(positions, means, count)
+    return Nodes(positions, radii.clamp_min(floor).to(positions), followed.to(positions.device))
+
+
+def _nearest(places: Tensor, points: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Return distances and indices (M, count), on the CPU, of the ``places`` (S, 3) nearest to
+    ``points`` (M, 3)."""
+    from scipy.spatial import KDTree
+
+    tree, queried = (x.detach().double().cpu().numpy() for x in (places, points))
+    ranks: Any = range(1, count + 1)
+    distances, indices = KDTree(tree).query(queried, k=ranks)
+    return torch.from_numpy(distances), torch.from_numpy(indices)
 
 
 def farthest_points(points: Tensor, count: int, taken: Tensor) -> Tensor:
@@ -86,8 +87,8 @@ def farthest_points(points: Tensor, count: int, taken: Tensor) -> Tensor:
     points = points.detach().double()
     picked: list[int] = []
     if len(taken):
-        nearest, _ = _tree(taken).query(points.cpu().numpy())
-        apart = torch.from_numpy(nearest).to(points.device).square()
+        nearest, _ = _nearest(taken, points, 1)
+        apart = nearest[:, 0].to(points.device).square()
     else:
         # largest at the mean
         squared_distances = (points - points.mean(0)).square().sum(1)
@@ -119,17 +120,6 @@ def blend_node_motion(
     return build_offsets(moved, blended, heads)
 
 
-def rotate_by_offsets(offsets: Tensor, vectors: Tensor) -> Tensor:
-    """Rotate ``vectors`` (..., 3) by quaternions identity + ``offsets`` (..., 4), any norm."""
-    return rotate(offsets + identity_quat(offsets), vectors)
-
-
-def _tree(points: Tensor) -> KDTree:
-    from scipy.spatial import KDTree
-
-    return KDTree(points.double().cpu().numpy())
-
-
 def spline_basis(places: Tensor, pieces: int) -> Tensor:
     """Return weights (K, pieces + 3), float64, of a uniform cubic B-spline at ``places`` (K,) in
     [0, 1]."""
@@ -142,7 +132,6 @@ def spline_basis(places: Tensor, pieces: int) -> Tensor:
     return torch.from_numpy(basis).to(places.device)
 
 
-NO_NODES = torch.zeros(0, 3, device="cpu")
 LR = {"quats": 6e-3, "log_scales": 1e-3, "logit_opacities": 1e-2, "colors": 2e-3}
 """Learning rates of node attributes other than positions."""
 LR_DECAY = 0.2  # ratio of the last to the first learning rate
@@ -168,7 +157,7 @@ class ControlNodes(DeformationField):
         self.num_pieces = options.pieces or min(
             max(1, round(PIECES_PER_TIME * setup.num_times)), MAX_KEY_TIMES
         )
-        self.buffers = {"positions": NO_NODES}
+        self.buffers = {"positions": torch.zeros(0, 3, device="cpu")}
         self.parameters = self._untrained(0)
 
     def with_state(self, tensors: Mapping[str, Tensor]) -> ControlNodes:
@@ -223,27 +212,24 @@ class ControlNodes(DeformationField):
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
         if not len(means):  # also without nodes
             return self.offsets_of_nodes(time).select(slice(0))
-        return self._blend(means, rows, *self._motion(means, time))
+        return self._at(means, time, rows)[0]
 
     def in_training(self, means: Tensor, time: float) -> tuple[Offsets, dict[str, Tensor]]:
         if not len(means):
             return super().in_training(means, time)
-        motion, values = self._motion(means, time)
-        return self._blend(means, None, motion, values), self._penalties(motion)
+        offsets, motion = self._at(means, time, None)
+        return offsets, self._penalties(motion)
 
     def penalties(self, time: float) -> dict[str, Tensor]:
         return self._penalties(spline_motion(self._heads(), time)[0])
 
-    def _motion(self, means: Tensor, time: float) -> tuple[Tensor, Tensor]:
-        self.update_nodes(means)
-        return spline_motion(self._heads(), time)
-
-    def _blend(self, means: Tensor, rows: Tensor | None, motion: Tensor, values: Tensor) -> Offsets:
+    def _at(self, means: Tensor, time: float, rows: Tensor | None) -> tuple[Offsets, Tensor]:
+        """Return ``offsets`` and the motion (S, 7) of the nodes."""
         nodes = self.update_nodes(means)
+        motion, values = spline_motion(self._heads(), time)
         nodes = replace(nodes, followed=select_rows(nodes.followed, rows))
-        return blend_node_motion(
-            nodes, select_rows(means, rows), motion, values, head_sizes(self.options)
-        )
+        means = select_rows(means, rows)
+        return blend_node_motion(nodes, means, motion, values, head_sizes(self.options)), motion
 
     def _penalties(self, motion: Tensor) -> dict[str, Tensor]:
         """Return the regularisers: node acceleration and as-rigid-as-possible, in squared node
@@ -273,7 +259,7 @@ class ControlNodes(DeformationField):
         device = self.setup.center.device
         after = torch.arange(1, last - high + 1, device=device)[:, None]
         before = torch.arange(low, 0, -1, device=device)[:, None]
-        for x in (self.parameters[name].data for name in head_sizes(self.options)):
+        for x in self.parameters.values().values():
             pace = (x[:, high] - x[:, high - reach]) / max(reach, 1)
             x[:, high + 1 :] = x[:, high, None] + after * pace[:, None]
             pace = (x[:, low] - x[:, low + reach]) / max(reach, 1)
@@ -292,10 +278,7 @@ class ControlNodes(DeformationField):
         }
         assert self.options.lr_means is not None
         rates = {"means": self.options.lr_means * self.setup.extent} | LR
-        return Parameters(tensors, {name: rates[name] for name in sizes}, LR_DECAY)
-
-    def _splines(self) -> dict[str, Tensor]:
-        return {name: self.parameters[name].detach() for name in head_sizes(self.options)}
+        return Parameters(tensors, rates, LR_DECAY)
 
     def _heads(self) -> list[Tensor | None]:
         return [self.parameters.get(field.name) for field in fields(Offsets)]
@@ -318,11 +301,10 @@ class ControlNodes(DeformationField):
         source = torch.cat([kept, torch.zeros(len(added), dtype=torch.long, device=kept.device)])
         is_new = torch.arange(len(source), device=source.device) >= len(kept)
         started = self._motion_at(means[added])
-        values = {name: torch.cat([x[kept], started[name]]) for name, x in self._splines().items()}
+        splines = self.parameters.values()
+        values = {name: torch.cat([x[kept], started[name]]) for name, x in splines.items()}
         self.parameters = self.parameters.reorder(values, source, is_new)
-        self._assign_followers(torch.cat([old[kept], means[added]]), means)
-
-    def _assign_followers(self, positions: Tensor, means: Tensor) -> None:
+        positions = torch.cat([old[kept], means[added]])
         nodes = build_nodes(positions, means)
         around = build_nodes(positions, positions).followed[:, 1:]
         buffers = {"radii": nodes.radii, "followed": nodes.followed, "neighbours": around}
@@ -331,7 +313,7 @@ class ControlNodes(DeformationField):
     def _motion_at(self, points: Tensor) -> dict[str, Tensor]:
         """Return control points (S', P, size) by head, interpolated from the present nodes at
         ``points``."""
-        splines = self._splines()
+        splines = self.parameters.values()
         if not self.num_nodes or not len(points):
             return {name: x.new_zeros(len(points), *x.shape[1:]) for name, x in splines.items()}
         nodes = build_nodes(self.buffers["positions"], points)
@@ -344,6 +326,7 @@ class ControlNodes(DeformationField):
             arms = (points[:, None] - nodes.positions[nodes.followed])[:, :, None].expand(
                 -1, -1, self.num_points, -1
             )
-            swing = rotate_by_offsets(splines["quats"][nodes.followed], arms) - arms
+            turns = splines["quats"][nodes.followed]
+            swing = rotate(turns + identity_quat(turns), arms) - arms
             started["means"] = started["means"] + torch.einsum("mb,mbpd->mpd", weights, swing)
         return started
