@@ -18,7 +18,7 @@ from dyngs.deform.keys import DynamicModel
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.filters import apply_filter, filter_state, restore_filter
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep, restore_times, times_state
-from dyngs.gaussians.visibility import VisibilityMasks, intersect_sorted
+from dyngs.gaussians.visibility import VisibilityMasks, intersect_sorted, row_positions
 from dyngs.models.renderable import Renderable, clamp_time
 from dyngs.ops.quaternions import identity_quat
 
@@ -126,9 +126,7 @@ class DynamicScene(GaussianScene):
         return part.deform(self.field, time, in_training=True, eye=eye)
 
     def apply_edit(self, edit: TopologyEdit) -> DynamicScene:
-        position = torch.full((len(self),), -1, device=self.moving.device)
-        position[self.moving] = torch.arange(len(self.moving), device=self.moving.device)
-        descent = position[edit.source]
+        descent = row_positions(self.moving, len(self))[edit.source]
         rows = torch.nonzero(descent >= 0)[:, 0]
         field = self.field
         if field is not None:

@@ -34,6 +34,7 @@ from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.filters import FILTER_VARIANCE, FilterUpdate, filter_std
 from dyngs.gaussians.model import SceneTraining
 from dyngs.gaussians.scene import GaussianTimeStep
+from dyngs.gaussians.visibility import row_positions
 from dyngs.ops.adam import Count
 
 PX_PER_OPACITY = 6.0
@@ -188,11 +189,9 @@ class DynamicTraining(SceneTraining[DynamicScene]):
             return result
         if "means" not in result.changes or scene.is_static:
             return result
-        position = torch.full((len(scene),), -1, device=scene.device)
-        position[scene.moving] = torch.arange(len(scene.moving), device=scene.device)
         old = scene.gaussians.log_scales.detach()[result.edit.source]
         shrunk = (result.changes["log_scales"] != old).any(1)
-        origin = position[result.edit.source]
+        origin = row_positions(scene.moving, len(scene))[result.edit.source]
         children = torch.nonzero(shrunk & (origin >= 0))[:, 0]
         source = result.edit.source[children]
         gaussians = scene.gaussians.detach().select(source)

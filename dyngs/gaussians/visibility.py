@@ -58,13 +58,12 @@ class VisibilityMasks:
         return with_role({"times": times, "bits": self.bits, "count": count}, Role.SHARED)
 
     @staticmethod
-    def from_state(state: Mapping[str, Tensor], count: int | None = None) -> VisibilityMasks | None:
+    def from_state(state: Mapping[str, Tensor], count: int) -> VisibilityMasks | None:
         """Return the masks in a state that ``state()`` returned; None for an empty state."""
         if not state:
             return None
         times = state["times"]
         bits = state["bits"]
-        count = int(state["count"]) if count is None else count
         ascends = times.ndim == 1 and len(times) > 1 and bool((times[1:] > times[:-1]).all())
         of_all = bits.dtype == torch.uint8 and bits.shape == (times.numel(), -(-count // BITS))
         if not (ascends and of_all and state["count"].tolist() == [count]):
@@ -75,11 +74,16 @@ class VisibilityMasks:
 def intersect_sorted(rows: Tensor, active: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Return positions of the common indices in ``rows`` and in ``active`` (both ascending, <
     ``count``)."""
-    place = torch.full((count,), -1, device=rows.device)
-    place[rows] = torch.arange(len(rows), device=rows.device)
-    matches = place[active]
+    matches = row_positions(rows, count)[active]
     places = torch.nonzero(matches >= 0)[:, 0]
     return matches[places], places
+
+
+def row_positions(rows: Tensor, count: int) -> Tensor:
+    """Return (count,) the position of each index in ``rows`` (M,); -1 for indices not in it."""
+    positions = torch.full((count,), -1, device=rows.device)
+    positions[rows] = torch.arange(len(rows), device=rows.device)
+    return positions
 
 
 def _unpacked(bits: Tensor, count: int) -> Tensor:
