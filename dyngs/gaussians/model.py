@@ -79,9 +79,9 @@ class SceneTraining(Generic[S]):
         Gaussian."""
         return None
 
-    def frozen_mask(self) -> FrozenMask | None:
+    def frozen_mask(self) -> FrozenMask:
         """Return the parameters that are frozen during training."""
-        return None
+        return FrozenMask()
 
     def after_step(self, scene: S, step: int, edited: bool) -> S:
         """Return the scene for the next step: 3D filter updated, motion extrapolated, Gaussians
@@ -253,8 +253,7 @@ class GaussianModel(Model[GaussianScene]):
         bad = bad + self.colours.optimize(step) + self.training.optimize(self._scene, step)
         result = self.densifier.edit(step, self._optimizer.parameters, generator)
         if result is not None:
-            if frozen_mask is not None:
-                result = frozen_mask.exclude_from_edit(result, self._optimizer.parameters)
+            result = frozen_mask.exclude_from_edit(result, self._optimizer.parameters)
             result = self.training.split_in_time(self._scene, result, generator)
             self._apply(self._sort_by_morton_code(result))
         self._perturb(lr_means)
@@ -273,16 +272,12 @@ class GaussianModel(Model[GaussianScene]):
 
     def _perturb(self, lr_means: float) -> None:
         """Add the noise of the strategy to the means, except those of frozen Gaussians."""
-        frozen_mask = self.training.frozen_mask()
-        means = self._optimizer.parameters.means
-        kept = (
-            None
-            if frozen_mask is None or frozen_mask.rows is None
-            else means.detach()[frozen_mask.rows]
-        )
+        rows = self.training.frozen_mask().rows
+        means = self._optimizer.parameters.means.detach()
+        kept = None if rows is None else means[rows]
         self.densifier.perturb(self._optimizer.parameters, lr_means, self._generator)
-        if frozen_mask is not None and kept is not None:
-            means.detach()[frozen_mask.rows] = kept
+        if kept is not None:
+            means[rows] = kept
 
     def replace_scene(self, scene: GaussianScene) -> None:
         """Continue with ``scene``: same Gaussians with other motion, masks or render options."""

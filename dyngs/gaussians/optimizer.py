@@ -319,7 +319,7 @@ class GaussianOptimizer:
         *,
         frozen_harmonics: Tensor | None = None,
         skip_unseen_rows: Tensor | None = None,
-        frozen_mask: FrozenMask | None = None,
+        frozen_mask: FrozenMask = FrozenMask(),
     ) -> Count:
         """Update the parameters and clear the gradients; return the number of skipped rows.
 
@@ -330,7 +330,7 @@ class GaussianOptimizer:
                 gradient; None: none.
             frozen_mask: parameters that are not updated at all.
         """
-        rows = None if frozen_mask is None or frozen_mask.rows is None else ~frozen_mask.rows
+        rows = None if frozen_mask.rows is None else ~frozen_mask.rows
         if skip_unseen_rows is not None:
             seen = self._rows_with_gradient()[skip_unseen_rows]
             rows = seen.new_ones(len(self.parameters)) if rows is None else rows
@@ -348,7 +348,7 @@ class GaussianOptimizer:
             self._adam.update(name, x, rates[name], rows)
             for name, x in self.parameters.tensors().items()
         ]
-        if frozen_mask is not None and frozen_mask.shapes:
+        if frozen_mask.shapes:
             updates = updates[-1:]  # only the SH coefficients
         return self._adam.steps_(updates, step=step, eps=ADAM_EPS)
 

@@ -99,22 +99,23 @@ class StaticTraining(SceneTraining[StaticScene]):
     def __init__(
         self,
         update: FilterUpdate,
-        build_pruning_edit: SmallGaussianPruning = SmallGaussianPruning(),
-        frozen_mask: FrozenMask | None = None,
+        pruning: SmallGaussianPruning = SmallGaussianPruning(),
+        frozen_mask: FrozenMask = FrozenMask(),
     ) -> None:
         self._update = update
-        self._pruning = build_pruning_edit
+        self._pruning = pruning
         self._frozen_mask = frozen_mask
 
-    def frozen_mask(self) -> FrozenMask | None:
+    def frozen_mask(self) -> FrozenMask:
         return self._frozen_mask
 
     def apply_edit(self, edit: TopologyEdit) -> None:
-        if self._frozen_mask is not None and self._frozen_mask.rows is not None:
-            self._frozen_mask = replace(self._frozen_mask, rows=edit.apply(self._frozen_mask.rows))
+        rows = self._frozen_mask.rows
+        if rows is not None:
+            self._frozen_mask = replace(self._frozen_mask, rows=edit.apply(rows))
 
     def state(self) -> State:
-        rows = None if self._frozen_mask is None else self._frozen_mask.rows
+        rows = self._frozen_mask.rows
         return {} if rows is None else {"frozen": StateTensor(rows, Role.TRAINING)}
 
     def first_scene(self, gaussians: Gaussians) -> StaticScene:
@@ -126,23 +127,28 @@ class StaticTraining(SceneTraining[StaticScene]):
         return scene
 
     def edit_scene(self, scene: StaticScene, step: int) -> tuple[StaticScene, EditResult] | None:
-        rows = None if self._frozen_mask is None else self._frozen_mask.rows
-        result = self._pruning.edit(scene, rows) if step == self._pruning.step else None
+        result = (
+            self._pruning.edit(scene, self._frozen_mask.rows)
+            if step == self._pruning.step
+            else None
+        )
         if result is None or result.edit is None:
             return None
         return scene.apply_edit(result.edit), result
 
     def restore(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> StaticScene:
-        if self._frozen_mask is not None and "frozen" in tensors:
+        if "frozen" in tensors:
             frozen = require_tensor("frozen", tensors["frozen"], (len(gaussians),), torch.bool)
             self._frozen_mask = replace(self._frozen_mask, rows=frozen.to(gaussians.means.device))
         return StaticScene.from_state(gaussians, tensors)
 
 
-def _build_frozen_mask(run: StartContext) -> FrozenMask | None:
+def _build_frozen_mask(run: StartContext) -> FrozenMask:
     init = run.config.init
+    if not isinstance(init, SceneInit):
+        return FrozenMask()
     rows = None if run.first is None else run.first.frozen
-    return FrozenMask(rows, init.trainable == "colour") if isinstance(init, SceneInit) else None
+    return FrozenMask(rows, init.trainable == "colour")
 
 
 def start(run: StartContext) -> GaussianModel:
