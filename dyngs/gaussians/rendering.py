@@ -142,13 +142,12 @@ def render(
             not positive, a background or probe of another shape, cameras on another device than the
             Gaussians, or a render too large for memory.
     """
-    gaussians, cameras = _validate_inputs(gaussians, cameras, background, options)
     if probe is not None and probe.shape != (len(cameras), len(gaussians), 4):
         raise DyngsError(
             f"probe must be ({len(cameras)}, {len(gaussians)}, 4), got {tuple(probe.shape)}"
         )
-    projection, opacities = _project(gaussians, cameras, options)
-    colors = _colors(gaussians, cameras, projection.radii, options, shader)
+    gaussians, cameras, projection, opacities = _project(gaussians, cameras, background, options)
+    colors = shade(gaussians, cameras, projection.radii, options, shader)
     # colours may overflow although all inputs are finite
     if options.nonfinite == "error":
         check_finite({"colors": colors}, "lower sh, or the weights of the network that colours")
@@ -209,8 +208,7 @@ def depths_and_contributions(
     gaussians: Gaussians, cameras: Cameras, options: RenderOptions = RenderOptions()
 ) -> tuple[BlendedImages, Tensor]:
     """Return weighted depth images (V, H, W, 1) and the ``contributions`` (V, N)."""
-    gaussians, cameras = _validate_inputs(gaussians.detach(), cameras, None, options)
-    projection, opacities = _project(gaussians, cameras, options)
+    _, cameras, projection, opacities = _project(gaussians.detach(), cameras, None, options)
     size = (cameras.width, cameras.height)
     depths = projection.depths[..., None]
     return blend_and_tally(projection, opacities, depths, size, Tally.WEIGHTS, options.blending)
@@ -228,9 +226,10 @@ def sensitivities(
 
     I is the sum of a pixel's channels, G the value of the 2D Gaussian at the pixel.
     """
-    gaussians, cameras = _validate_inputs(gaussians.detach(), cameras, background, options)
-    projection, opacities = _project(gaussians, cameras, options)
-    colors = _colors(gaussians, cameras, projection.radii, options, shader)
+    gaussians, cameras, projection, opacities = _project(
+        gaussians.detach(), cameras, background, options
+    )
+    colors = shade(gaussians, cameras, projection.radii, options, shader)
     if background is not None:
         background = background.to(colors).expand(len(cameras), 3)
     size = (cameras.width, cameras.height)
@@ -240,13 +239,14 @@ def sensitivities(
     )
 
 
-def _colors(
+def shade(
     gaussians: Gaussians,
     cameras: Cameras,
     radii: Tensor,
     options: RenderOptions,
-    shader: Shader | None,
+    shader: Shader | None = None,
 ) -> Tensor:
+    """Return the colours (V, N, 3) of Gaussians; see ``Shader``. Without one from their SH."""
     if shader is not None:
         return shader(gaussians, cameras, radii)
     degree = (
@@ -258,8 +258,10 @@ def _colors(
 
 
 def _project(
-    gaussians: Gaussians, cameras: Cameras, options: RenderOptions
-) -> tuple[Projection, Tensor]:
+    gaussians: Gaussians, cameras: Cameras, background: Tensor | None, options: RenderOptions
+) -> tuple[Gaussians, Cameras, Projection, Tensor]:
+    """Return the validated Gaussians and cameras, projections, and opacities (V, N)."""
+    gaussians, cameras = _validate_inputs(gaussians, cameras, background, options)
     opacities = gaussians.opacities
     projection = project(
         gaussians.means, gaussians.quats, gaussians.scales, opacities, cameras, options.projection
@@ -267,7 +269,7 @@ def _project(
     per_view = opacities.expand(len(cameras), -1)
     if options.mode == RasterizeMode.ANTIALIASED:
         per_view = per_view * projection.compensations
-    return projection, per_view
+    return gaussians, cameras, projection, per_view
 
 
 def _validate_inputs(

@@ -20,9 +20,8 @@ from dyngs.core.tensor_checks import require_tensor
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import ColourNetwork
 from dyngs.gaussians.optimizer import Parameters
-from dyngs.gaussians.rendering import RenderOptions, contributions, render
+from dyngs.gaussians.rendering import RenderOptions, contributions, render, shade
 from dyngs.ops.adam import Count
-from dyngs.ops.harmonics import evaluate_harmonics
 from dyngs.ops.shading import num_inputs
 
 _CLAMP_OFFSET = 64.0  # offset that keeps colours above the clamp at 0; float32 still resolves 4e-6
@@ -141,13 +140,8 @@ def _view_dependent_colour(
     """Return the colour (N, 3) that SH above degree 0 add; 0 for Gaussians without contribution."""
     lifted = gaussians.sh.clone()
     lifted[:, 0] = _CLAMP_OFFSET / SH_C0
-    degree = (
-        gaussians.sh_degree
-        if options.sh_degree is None
-        else min(options.sh_degree, gaussians.sh_degree)
-    )
     radii = (fraction > 0).int()[None, :, None].expand(1, -1, 2).contiguous()
-    colors = evaluate_harmonics(gaussians.means, camera.centers, lifted, radii, degree)[0]
+    colors = shade(gaussians.replace(sh=lifted), camera, radii, options)[0]
     return torch.where(fraction[:, None] > 0, colors - _CLAMP_OFFSET - 0.5, 0.0)
 
 
