@@ -9,6 +9,7 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -458,21 +459,17 @@ def compute_relocation(
     Returns:
         o' (n,) and the factor (n,), float64.
     """
+    from scipy.linalg import pascal
+
     eps = torch.finfo(torch.float32).eps
     opacities = opacities.double().clamp_max(1 - eps)
     copies = copies.clamp(1, MAX_COPIES)
     thinner = -torch.expm1(torch.log1p(-opacities) / copies)
     thinner = thinner.clamp(min_opacity, 1 - eps)
     j = torch.arange(1, MAX_COPIES + 1, dtype=torch.float64, device=opacities.device)
+    binomials = torch.from_numpy(np.asarray(pascal(MAX_COPIES + 1, "lower"), np.float64))
     profile = (
-        _binomials().to(copies.device)[copies][:, 1:]
-        * torch.where(j % 2 == 1, 1.0, -1.0)
-        / j.sqrt()
+        binomials.to(copies.device)[copies][:, 1:] * torch.where(j % 2 == 1, 1.0, -1.0) / j.sqrt()
     )
     powers = (thinner.log()[:, None] * j).exp()  # torch.pow would depend on the number of threads
     return thinner, opacities / (profile * powers).sum(1)
-
-
-def _binomials() -> Tensor:
-    rows = [[float(math.comb(n, j)) for j in range(MAX_COPIES + 1)] for n in range(MAX_COPIES + 1)]
-    return torch.tensor(rows, dtype=torch.float64, device="cpu")
