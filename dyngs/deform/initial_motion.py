@@ -173,11 +173,11 @@ def _gaussians_at(points: np.ndarray, colours: np.ndarray, num_terms: int) -> Ga
     from scipy.spatial import KDTree
 
     distances, _ = KDTree(points).query(points, k=NEIGHBOURS + 1)
-    stds = (SCALE * distances[:, 1:].mean(1)).clip(1e-9)
-    base = torch.from_numpy((colours - 0.5) / SH_C0).float()
-    gaussians = Gaussians.isotropic(torch.from_numpy(points).float(), 0.0, LOGIT, base, num_terms)
-    log_scales = torch.from_numpy(np.log(stds)).float()[:, None].repeat(1, 3)
-    return gaussians.replace(log_scales=log_scales)
+    log_stds = np.log((SCALE * distances[:, 1:].mean(1, keepdims=True)).clip(1e-9))
+    means, sizes, base = (
+        torch.from_numpy(x).float() for x in (points, log_stds, (colours - 0.5) / SH_C0)
+    )
+    return Gaussians.isotropic(means, sizes, LOGIT, base, num_terms)
 
 
 def _box(clips: Sequence[FixedCameraClip], static: Gaussians, extent: float) -> np.ndarray:

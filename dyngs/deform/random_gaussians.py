@@ -32,14 +32,11 @@ def random_gaussians(
 def with_gaussians(gaussians: Gaussians, added: Sequence[Gaussians]) -> EditResult:
     """Return the edit that appends ``added`` (same SH degree, any device) to ``gaussians``."""
     device = gaussians.means.device
-    count = sum(map(len, added))
-    old = torch.arange(len(gaussians), device=device)
-    new = torch.zeros(count, dtype=torch.long, device=device)
-    source = torch.cat([old, new])
-    is_new = torch.arange(len(source), device=device) >= len(gaussians)
-    parts = [part.to(device=device).tensors() for part in (gaussians, *added)]
-    changes = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
-    return EditResult(TopologyEdit(source, is_new), changes)
+    rows = torch.arange(len(gaussians) + sum(map(len, added)), device=device)
+    is_new = rows >= len(gaussians)
+    source = rows.masked_fill(is_new, 0)
+    parts = [part.to(device=device) for part in (gaussians, *added)]
+    return EditResult(TopologyEdit(source, is_new), Gaussians.joined(parts).tensors())
 
 
 def box_of(gaussians: Gaussians, extent: float) -> tuple[Tensor, Tensor]:
