@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import cast
 
 import numpy as np
@@ -46,12 +47,11 @@ class FrameStack:
     depths: np.ndarray  # (T, H, W) of the static model, ``NO_DEPTH`` where it is transparent
     poses: np.ndarray  # (T, 4, 4) cam_from_world
     intrinsics: np.ndarray  # (T, 3, 3)
-    centers: np.ndarray = field(init=False)  # (T, 3) camera positions
 
-    def __post_init__(self) -> None:
-        rotations = self.poses[:, :3, :3]
-        shifts = self.poses[:, :3, 3]
-        object.__setattr__(self, "centers", -np.einsum("tji,tj->ti", rotations, shifts))
+    @cached_property
+    def centers(self) -> np.ndarray:
+        """Camera positions (T, 3)."""
+        return -np.einsum("tji,tj->ti", self.poses[:, :3, :3], self.poses[:, :3, 3])
 
     def __len__(self) -> int:
         return len(self.times)
@@ -331,7 +331,9 @@ def _colors(
 
 def _colour_variation(frame_stack: FrameStack, discs: DiscContrast, path: Path) -> float:
     """Return the standard deviation of colours along a path; large if it switches objects."""
-    which = np.nonzero(_contrast(frame_stack, discs, path.centers, path.radius) > MIN_PEAK)[0]
+    images = np.arange(len(frame_stack))
+    contrast = _contrast(frame_stack, discs, images, path.centers, path.radius)
+    which = np.nonzero(contrast > MIN_PEAK)[0]
     if len(which) < 2:
         return 0.0
     colors = _colors(frame_stack, which, path.centers[which], np.full(len(which), path.radius))
@@ -339,11 +341,15 @@ def _colour_variation(frame_stack: FrameStack, discs: DiscContrast, path: Path) 
 
 
 def _contrast(
-    frame_stack: FrameStack, discs: DiscContrast, centers: np.ndarray, radius: float
+    frame_stack: FrameStack,
+    discs: DiscContrast,
+    which: np.ndarray,
+    centers: np.ndarray,
+    radii: np.ndarray | float,
 ) -> np.ndarray:
-    which = np.arange(len(frame_stack))
+    """Return the contrast (n,) of balls at ``centers`` (n, 3) in the images ``which`` (n,)."""
     pixels, depths = frame_stack.project(which, centers)
-    return discs.at(which, pixels, radius * frame_stack.focal / depths)
+    return discs.at(which, pixels, radii * frame_stack.focal[which] / depths)
 
 
 @dataclass(frozen=True)
@@ -377,20 +383,19 @@ def _fit_segments(
     counts = np.array([len(one) for one in peaks])
     table = np.stack([np.resize(one, (PEAKS, 3)) for one in peaks])
     for middle in range(HALF_WINDOW, len(frame_stack) - HALF_WINDOW, 2):
-        near = [t for t in range(middle - HALF_WINDOW, middle + HALF_WINDOW + 1) if counts[t]]
+        times = range(middle - HALF_WINDOW, middle + HALF_WINDOW + 1)
+        near = [t for t in times if counts[t]]
         if len(near) < 3:
             continue
         which = random.permuted(np.tile(near, (TRIPLES, 1)), axis=1)[:, :3]
         picked = table[which, random.integers(0, counts[which])]
         centers, steps, radii = _fit_lines(frame_stack, which, middle, picked)
-        values = []
-        for t in range(middle - HALF_WINDOW, middle + HALF_WINDOW + 1):
-            pixels, depths = frame_stack.project(
-                np.full(len(centers), t), centers + (t - middle) * steps
+        values = [
+            _contrast(
+                frame_stack, discs, np.full(len(radii), t), centers + (t - middle) * steps, radii
             )
-            values.append(
-                discs.at(np.full(len(centers), t), pixels, radii * frame_stack.focal[t] / depths)
-            )
+            for t in times
+        ]
         scores = np.sort(np.array(values), axis=0)[1:].mean(0)
         kept = []
         for i in np.argsort(-scores, kind="stable"):
@@ -400,7 +405,6 @@ def _fit_segments(
                 kept.append(i)
         if kept:
             scores, centers, steps, radii = (x[kept] for x in (scores, centers, steps, radii))
-            times = np.arange(middle - HALF_WINDOW, middle + HALF_WINDOW + 1)
             shown = [
                 _colors(frame_stack, np.full(len(kept), t), centers + (t - middle) * steps, radii)
                 for t in times
@@ -539,6 +543,9 @@ def _track_path(frame_stack: FrameStack, discs: DiscContrast, start: PathStart) 
     ways = np.zeros((count, 3))
     weights = np.zeros(count)
 
+    def mean_contrast(size: float) -> float:
+        return float(_contrast(frame_stack, discs, np.arange(count), centers, size).mean())
+
     def looked(which: np.ndarray, reach: float) -> np.ndarray:
         ways[which], weights[which] = _search_discs(
             frame_stack, discs, which, centers[which], radius, reach
@@ -556,15 +563,8 @@ def _track_path(frame_stack: FrameStack, discs: DiscContrast, start: PathStart) 
     for turn in range(ROUNDS):
         centers = looked(np.arange(count), REACH)
         if turn % 2:
-            sizes = radius * np.geomspace(0.8, 1.25, 9)
-            radius = float(
-                sizes[
-                    np.argmax(
-                        [_contrast(frame_stack, discs, centers, size).mean() for size in sizes]
-                    )
-                ]
-            )
-    return Path(centers, radius, float(_contrast(frame_stack, discs, centers, radius).mean()))
+            radius = float(max(radius * np.geomspace(0.8, 1.25, 9), key=mean_contrast))
+    return Path(centers, radius, mean_contrast(radius))
 
 
 def _search_discs(
