@@ -45,17 +45,8 @@ def deform_schedule(model: DynamicModel, rates: RateSchedule) -> DeformSchedule:
     window_grows_from = max(coarse_end, round(model.time_window_grows_from * steps))
     window_full_at = max(window_grows_from, round(model.time_window_full_at * steps))
     decay_from = window_full_at if model.time_window < 1 else coarse_end
-    freeze_steps = (
-        sorted(
-            {
-                window_full_at + round(fraction * (steps - window_full_at))
-                for fraction in FREEZE_FRACTIONS
-            }
-        )
-        if model.freeze_below_px > 0
-        else []
-    )
-    freeze_steps = tuple(step for step in freeze_steps if step > window_full_at)
+    after = {round(fraction * (steps - window_full_at)) for fraction in FREEZE_FRACTIONS} - {0}
+    freeze_steps = tuple(window_full_at + x for x in sorted(after) if model.freeze_below_px > 0)
     return DeformSchedule(
         coarse_end, window_grows_from, window_full_at, decay_from, freeze_steps, rates
     )

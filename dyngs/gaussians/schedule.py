@@ -109,7 +109,7 @@ def densify_schedule(
     """
     start = max(scale_step(strategy.start, steps), min(strategy.start, MIN_START))
     stop = scale_step(strategy.stop, steps)
-    every = densify_interval(strategy, steps)
+    every = strategy.every or max(1, min(MAX_INTERVAL, round(INTERVAL_FRACTION * steps)))
     match strategy:
         case McmcStrategy():
             return DensifySchedule(start, stop, every)
@@ -125,11 +125,6 @@ def densify_schedule(
             return DensifySchedule(start, stop, every, resets, prune_scale_after=period)
         case _:
             assert_never(strategy)
-
-
-def densify_interval(strategy: DefaultStrategy | McmcStrategy, steps: int) -> int:
-    """Return the steps between densifications in a run of ``steps``."""
-    return strategy.every or max(1, min(MAX_INTERVAL, round(INTERVAL_FRACTION * steps)))
 
 
 def grad_threshold(strategy: DefaultStrategy, steps: int) -> float:
