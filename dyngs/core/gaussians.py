@@ -130,8 +130,8 @@ class Gaussians:
         """Return the tensors by field name, in the order of declaration."""
         return {f.name: getattr(self, f.name) for f in fields(self)}
 
-    def select(self, index: Tensor) -> Gaussians:
-        """Return the Gaussians at ``index`` ((M,) long or (N,) bool)."""
+    def select(self, index: Tensor | slice) -> Gaussians:
+        """Return the Gaussians at ``index`` ((M,) long, (N,) bool or a slice)."""
         return Gaussians(**{name: x[index] for name, x in self.tensors().items()})
 
     def picked(self, rows: Tensor) -> Gaussians:

@@ -64,12 +64,7 @@ class Levels:
     def block_gaussians(self, block: Block) -> Gaussians:
         """Return the Gaussians of a block, at most ``BLOCK``."""
         level, place = block
-        return Gaussians(
-            **{
-                name: x[place * BLOCK : (place + 1) * BLOCK]
-                for name, x in self.levels[level].tensors().items()
-            }
-        )
+        return self.levels[level].select(slice(place * BLOCK, (place + 1) * BLOCK))
 
     def count(self, block: Block) -> int:
         """Return the number of Gaussians of a block."""
