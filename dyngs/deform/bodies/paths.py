@@ -469,18 +469,12 @@ def _find_best_chain(
 
 def _interpolate_chain(chain: list[tuple[PathSegments, int]], count: int) -> PathStart:
     """Interpolate positions along a chain of segments."""
-    middles = np.array([piece.middle for piece, _ in chain])
-    places = np.array([piece.centers[k] for piece, k in chain])
-    centers = np.stack([np.interp(np.arange(count), middles, x) for x in places.T], axis=1)
-    first = int(middles[0]) - HALF_WINDOW
-    last = int(middles[-1]) + HALF_WINDOW
-    for (piece, k), times in zip(
-        (chain[0], chain[-1]),
-        (np.arange(first, middles[0]), np.arange(middles[-1] + 1, last + 1)),
-        strict=True,
-    ):
-        centers[times] += (times - piece.middle)[:, None] * piece.steps[k]
-    return PathStart(centers, float(np.median([piece.radii[k] for piece, k in chain])), first, last)
+    shifted = [(*chain[0], -HALF_WINDOW), *((*one, 0) for one in chain), (*chain[-1], HALF_WINDOW)]
+    times = [piece.middle + shift for piece, _, shift in shifted]
+    places = np.array([piece.centers[k] + shift * piece.steps[k] for piece, k, shift in shifted])
+    centers = np.stack([np.interp(np.arange(count), times, x) for x in places.T], axis=1)
+    radius = float(np.median([piece.radii[k] for piece, k in chain]))
+    return PathStart(centers, radius, times[0], times[-1])
 
 
 def _transition_costs(first: PathSegments, later: PathSegments) -> np.ndarray:
@@ -511,15 +505,11 @@ def _fit_lines(
     later = (which - middle).astype(float)
     across = across.reshape(count, 3, 3, 3)
     seen = np.einsum("ntij,ntj->nti", across, frame_stack.centers[flat].reshape(count, 3, 3))
-    blocks = [
-        [np.einsum("nt,ntij->nij", later ** (a + b), across) for b in range(2)] for a in range(2)
-    ]
-    left = np.concatenate([np.concatenate(row, axis=2) for row in blocks], axis=1)
+    powers = np.stack([np.ones_like(later), later])
+    left = np.einsum("ant,bnt,ntij->naibj", powers, powers, across).reshape(count, 6, 6)
     left[:, range(6), range(6)] += 1e-6
-    right = np.concatenate([np.einsum("nt,nti->ni", later**a, seen) for a in range(2)], axis=1)
-    solved = np.linalg.solve(left, right[..., None])[..., 0]
-    centers = solved[:, :3]
-    steps = solved[:, 3:]
+    right = np.einsum("ant,nti->nai", powers, seen).reshape(count, 6, 1)
+    centers, steps = np.linalg.solve(left, right).reshape(count, 2, 3).swapaxes(0, 1)
     places = (centers[:, None] + later[..., None] * steps[:, None]).reshape(-1, 3)
     pixels, depths = frame_stack.project(flat, places)
     misses = np.linalg.norm(pixels.reshape(count, 3, 2) - picked[..., :2], axis=-1).max(1)
