@@ -44,9 +44,9 @@ class SmallGaussianPruning:
     this Gaussian.
     """
 
-    step: int = 0  # step after which Gaussians are pruned; 0: never
-    pixels: float = 0.0
-    cameras: Sequence[Cameras] = ()
+    step: int  # step after which Gaussians are pruned
+    pixels: float
+    cameras: Sequence[Cameras]
 
     def edit(self, scene: StaticScene, protected: Tensor | None = None) -> EditResult | None:
         """Return the pruning edit, or None if all or no Gaussians contribute enough.
@@ -58,11 +58,8 @@ class SmallGaussianPruning:
         for cameras in self.cameras:
             weights = contributions(drawn, cameras.to(device=scene.device), scene.options)
             max_contribution = torch.maximum(max_contribution, weights.amax(0))
-        kept = (
-            max_contribution >= self.pixels
-            if protected is None
-            else (max_contribution >= self.pixels) | protected
-        )
+        kept = max_contribution >= self.pixels
+        kept = kept if protected is None else kept | protected
         if bool(kept.all()) or not bool(kept.any()):
             return None
         text = (
@@ -72,12 +69,12 @@ class SmallGaussianPruning:
         return EditResult(TopologyEdit.select(kept), message=text)
 
 
-def build_small_pruning(run: StartContext) -> SmallGaussianPruning:
-    """Return the pruning of small Gaussians, scheduled for the end of densification."""
+def build_small_pruning(run: StartContext) -> SmallGaussianPruning | None:
+    """Return the pruning of small Gaussians, scheduled for the end of densification; None: off."""
     config = run.config
     strategy = run.config.strategy
     if not (isinstance(strategy, DefaultStrategy) and strategy.prune_pixels > 0):
-        return SmallGaussianPruning()
+        return None
     views = run.capture.splits["train"]
     cameras = training_cameras(
         [views[i] for i in evenly_spaced(len(views), MEASURED_VIEWS)], config.data
@@ -99,7 +96,7 @@ class StaticTraining(SceneTraining[StaticScene]):
     def __init__(
         self,
         update: FilterUpdate,
-        pruning: SmallGaussianPruning = SmallGaussianPruning(),
+        pruning: SmallGaussianPruning | None = None,
         frozen_mask: FrozenMask = FrozenMask(),
     ) -> None:
         self._update = update
@@ -127,11 +124,9 @@ class StaticTraining(SceneTraining[StaticScene]):
         return scene
 
     def edit_scene(self, scene: StaticScene, step: int) -> tuple[StaticScene, EditResult] | None:
-        result = (
-            self._pruning.edit(scene, self._frozen_mask.rows)
-            if step == self._pruning.step
-            else None
-        )
+        if self._pruning is None or step != self._pruning.step:
+            return None
+        result = self._pruning.edit(scene, self._frozen_mask.rows)
         if result is None or result.edit is None:
             return None
         return scene.apply_edit(result.edit), result
