@@ -70,29 +70,24 @@ def find_view_dependent(
     decide. ``tolerance``: PSNR in dB that may be given up, see ``select_worthwhile``.
     """
     means, changes = _view_dependence_statistics(seen, options)
-    errors = []
-    worths = torch.zeros(len(changes), device=changes.device)
-    everywhere = torch.ones(len(changes), device=changes.device)
-    nowhere = torch.zeros(len(changes), device=changes.device)
-    for view in held_out:
-        errors.append(
-            [
-                _squared_error(view, means, x, options, background).item()
-                for x in (nowhere, everywhere)
-            ]
+    nowhere = torch.zeros_like(changes)
+
+    def error(fractions: Tensor) -> float:
+        return math.fsum(
+            _squared_error(view, means, fractions, options, background).item() for view in held_out
         )
-        half = torch.full((len(changes),), 0.5, requires_grad=True, device=changes.device)
+
+    worths = torch.zeros_like(changes)
+    for view in held_out:
+        half = torch.full_like(changes, 0.5, requires_grad=True)
         (slope,) = torch.autograd.grad(_squared_error(view, means, half, options, background), half)
         worths -= slope
-    without, with_all = (math.fsum(column) for column in zip(*errors, strict=True))
+    without = error(nowhere)
     kept_harmonics = select_worthwhile(changes, worths, without, tolerance)
-    kept = math.fsum(
-        _squared_error(x, means, kept_harmonics.float(), options, background).item()
-        for x in held_out
+    gain_all, gain_kept = (
+        _psnr_gain(without, error(x)) for x in (nowhere + 1, kept_harmonics.float())
     )
-    return ViewDependence(
-        kept_harmonics, means, _psnr_gain(without, with_all), _psnr_gain(without, kept)
-    )
+    return ViewDependence(kept_harmonics, means, gain_all, gain_kept)
 
 
 def select_worthwhile(changes: Tensor, worths: Tensor, without: float, tolerance: float) -> Tensor:
