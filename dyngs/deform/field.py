@@ -44,8 +44,7 @@ class Offsets:
     colors: Tensor | None = None
 
     def select(self, index: Tensor | slice) -> Offsets:
-        others = (self.quats, self.log_scales, self.logit_opacities, self.colors)
-        return Offsets(self.means[index], *(None if x is None else x[index] for x in others))
+        return Offsets(**{name: x[index] for name, x in vars(self).items() if x is not None})
 
 
 @dataclass(frozen=True)

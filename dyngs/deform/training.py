@@ -368,7 +368,14 @@ class DynamicTraining(SceneTraining[DynamicScene]):
                 lambda time: apply_offsets(now, field.offsets(means, time), scene.moving)
             )
             moves &= errors.typical[scene.moving] > SURELY_STATIC * self.options.motion_threshold
-        return _freeze(scene, mean, ~moves)
+        static = torch.nonzero(~moves)[:, 0]
+        kept = torch.nonzero(moves)[:, 0]
+        bake_(scene.gaussians, scene.moving[static], mean.select(static))
+        if not len(kept):
+            return replace(scene, field=None, moving=scene.moving[kept])
+        left = field.apply_edit(TopologyEdit.select(kept))
+        left.invalidate()
+        return replace(scene, field=left, moving=scene.moving[kept])
 
     def _time_noise(self, step: int) -> float:
         """Return a random offset of the time of a training view (Deformable-3DGS)."""
@@ -388,15 +395,3 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         tiny = 1e-6 * self.capture.extent
         length = (offsets.means.square().sum(1) + tiny**2).sqrt().mean()
         return {"motion sparsity": length * (self.options.motion_sparsity / self.capture.extent)}
-
-
-def _freeze(scene: DynamicScene, mean: Offsets, stays: Tensor) -> DynamicScene:
-    """Freeze the moving Gaussians where ``stays`` (M,) is true, at their ``mean`` offsets."""
-    static = torch.nonzero(stays)[:, 0]
-    kept = torch.nonzero(~stays)[:, 0]
-    bake_(scene.gaussians, scene.moving[static], mean.select(static))
-    if scene.field is None or not len(kept):
-        return replace(scene, field=None, moving=scene.moving[kept])
-    left = scene.field.apply_edit(TopologyEdit.select(kept))
-    left.invalidate()
-    return replace(scene, field=left, moving=scene.moving[kept])
