@@ -69,7 +69,7 @@ MUTATIONS = (
     ("gaussians/filters.py", "FILTER_VARIANCE = 0.2", "FILTER_VARIANCE = 0.3", "gaussians/test_filters.py"),
     ("gaussians/visibility.py", "self.bits[interval] | self.bits[interval + 1]", "self.bits[interval]", "gaussians/test_visibility.py"),
     ("gaussians/optimizer.py", "moved[~is_new] = x[source[~is_new]]", "moved[:] = x[source]", "gaussians/test_parameters.py"),
-    ("gaussians/optimizer.py", "(decay**progress if", "(decay * progress if", "gaussians/test_parameters.py"),
+    ("gaussians/optimizer.py", "decay**progress if", "decay * progress if", "gaussians/test_parameters.py"),
     ("deform/training.py", "2 * longest *", "longest *", "deform/test_motion.py"),
     ("deform/schedule.py", "oldest <= abs(time - MIDDLE) <= newest", "oldest < abs(time - MIDDLE) <= newest", "deform/test_time_window.py"),
     ("deform/schedule.py", "step % 2 == 0", "step % 2 == 1", "deform/test_time_window.py"),

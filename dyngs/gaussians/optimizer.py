@@ -182,24 +182,21 @@ class Parameters:
             progress: 0 at the first update, 1 at the last; sets the learning rates.
         """
         progress = min(progress, 1.0)
-        rates: dict[str, float] = {}
+        factors: dict[str, float] = {}
         for name in self._tensors:
             decay = self.decay[name] if isinstance(self.decay, Mapping) else self.decay
-            rates[name] = self.rates[name] * (decay**progress if decay > 0 else 1 - progress)
-        return self._update(step, rates)
+            factors[name] = decay**progress if decay > 0 else 1 - progress
+        return self.update(step, factors)
 
-    def update(self, step: int, factor: float) -> Count:
-        """Update all tensors with their learning rates times ``factor``; see ``step``."""
-        return self._update(step, {name: self.rates[name] * factor for name in self._tensors})
-
-    def _update(self, step: int, rates: Mapping[str, float]) -> Count:
-        updates = [self._update_of(name, x, rates[name]) for name, x in self._tensors.items()]
+    def update(self, step: int, factors: Mapping[str, float]) -> Count:
+        """Update all tensors with their learning rates times ``factors``; see ``step``."""
+        updates: list[AdamUpdate | None] = []
+        for name, x in self._tensors.items():
+            is_moving = self._roles[name] is Role.PER_MOVING
+            rows = seen_rows(x.grad) if is_moving and x.grad is not None else None
+            lr = self.rates[name] * factors[name]
+            updates.append(self._adam.update(name, x, lr, rows, along_last_axis=rows is None))
         return self._adam.steps_(updates, step=step)
-
-    def _update_of(self, name: str, x: Tensor, lr: float) -> AdamUpdate | None:
-        if self._roles[name] is not Role.PER_MOVING:
-            return self._adam.update(name, x, lr, along_last_axis=True)
-        return self._adam.update(name, x, lr, None if x.grad is None else seen_rows(x.grad))
 
     def apply_edit(self, role: Role, edit: TopologyEdit) -> Parameters:
         """Return the parameters after a topology edit of the rows with this ``role``."""

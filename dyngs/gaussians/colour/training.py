@@ -257,7 +257,8 @@ class NetworkTraining(ColourTraining):
         return ColourNetwork(tuple(layers), self.box, self.uses_time, self.options.normals)
 
     def optimize(self, step: int) -> Count:
-        return self.parameters.update(step, rate_factor(step, self.steps))
+        factor = rate_factor(step, self.steps)
+        return self.parameters.update(step, dict.fromkeys(self.parameters.rates, factor))
 
     def move_to(self, device: torch.device) -> None:
         self.box, self.parameters = self.box.to(device), self.parameters.to(device)
