@@ -93,9 +93,9 @@ class GaussianScene(Renderable):
         return torch.stack([means.amin(0), means.amax(0)]) if len(means) else means.new_zeros(2, 3)
 
     @property
-    @abstractmethod
     def rows(self) -> Tensor:
         """Ascending indices (M,) of the Gaussians that move."""
+        return torch.zeros(0, dtype=torch.long, device=self.gaussians.means.device)
 
     @property
     def num_moving(self) -> int:
@@ -109,7 +109,7 @@ class GaussianScene(Renderable):
     def offset_rows(self) -> Tensor:
         """Ascending indices (M',) of the Gaussians whose shape or attributes a field changes
         individually."""
-        return torch.zeros(0, dtype=torch.long, device=self.gaussians.means.device)
+        return self.rows[:0]
 
     @property
     def num_motion_values(self) -> int:

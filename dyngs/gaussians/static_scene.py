@@ -101,10 +101,6 @@ class StaticScene(GaussianScene):
         return True
 
     @property
-    def rows(self) -> Tensor:
-        return torch.zeros(0, dtype=torch.long, device=self.gaussians.means.device)
-
-    @property
     def num_moving(self) -> int:
         return 0  # constant, because it is read at every step
 
