@@ -154,24 +154,17 @@ def build_pruning_edit(trainer: GaussianTrainer) -> TrainingEdit:
     edit = build_removal_edit(
         trainer, importance_scores(trainer, options) if options.fraction > 0 else None
     )
-    message = f"pruned: {len(scene):,} -> "
-    if edit.keep is None:
-        return replace(
-            edit, message=f"{message}{format_count(len(scene), 'Gaussian')}{_let_through(edit)}"
-        )
-    gain = mean_psnr(trainer, scene.select(edit.keep)) - mean_psnr(trainer, scene)
-    left = format_count(int(edit.keep.sum()), "Gaussian")
-    cost = f"{gain:+.2f} dB before fine-tuning"
-    return replace(edit, message=f"{message}{left}, {cost}{_let_through(edit)}")
-
-
-def _let_through(edit: TrainingEdit) -> str:
+    left = scene if edit.keep is None else scene.select(edit.keep)
+    message = f"pruned: {len(scene):,} -> {format_count(len(left), 'Gaussian')}"
+    if edit.keep is not None:
+        gain = mean_psnr(trainer, left) - mean_psnr(trainer, scene)
+        message += f", {gain:+.2f} dB before fine-tuning"
     masks = edit.masks
-    if masks is None:
-        return ""
-    times = range(len(masks.times) - 1)
-    active = fmean(len(masks.active(k)) / max(masks.count, 1) for k in times)
-    return f"; visibility masks keep {active:.0%} of them"
+    if masks is not None:
+        times = range(len(masks.times) - 1)
+        active = fmean(len(masks.active(k)) / max(masks.count, 1) for k in times)
+        message += f"; visibility masks keep {active:.0%} of them"
+    return replace(edit, message=message)
 
 
 @torch.no_grad()
