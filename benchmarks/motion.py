@@ -34,7 +34,7 @@ from dyngs.config import Config, PointsInit, RandomInit
 from dyngs.config.io import load_config
 from dyngs.core.metrics import Lpips
 from dyngs.core.state import Role
-from dyngs.data.capture import View
+from dyngs.data.capture import PointCloud, View
 from dyngs.data.loader import ImageLoader
 from dyngs.data.synthetic.captures import (
     CAMERA_ANGLE_X,
@@ -56,7 +56,7 @@ from dyngs.evaluate.report import evaluate_run, split_views
 from dyngs.evaluate.view_scores import Regions, score_views
 from dyngs.gaussians import TopologyEdit
 from dyngs.gaussians.filters import FilterUpdate
-from dyngs.gaussians.initialization import InitialValues, initial_gaussians, scene_geometry
+from dyngs.gaussians.initialization import InitialValues, initial_gaussians
 from dyngs.gaussians.optimizer import Parameters
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.schedule import RateSchedule
@@ -194,7 +194,7 @@ def oracle(name: SceneName, config: Config, seed: int = 0) -> GaussianTrainer:
     capture = read_capture(config.data)  # in the unit of the files, in which the true motion is
     trainer = build_trainer(config, capture)
     points, colours, labels = surface_points(name, capture.splits["train"], seed)
-    start = replace(scene_geometry(capture), points=points, points_rgb=colours)
+    start = replace(capture, points=PointCloud(points, colours))
     generator = torch.Generator().manual_seed(seed)
     values = InitialValues.for_strategy(config.strategy)
     gaussians = initial_gaussians(start, PointsInit(), values, model.sh_degree, generator)

@@ -80,8 +80,7 @@ def cube_half_side(half_extent: Length, views: Sequence[View], world_scale: floa
     """Return half the side, in scene units, of the cube that ``init.half_extent`` specifies."""
     if half_extent != "auto":
         return half_extent / world_scale
-    centers = np.array([camera_center(view.cam_from_world) for view in views])
-    return CUBE_PER_EXTENT * (camera_extent(centers) or TYPICAL_EXTENT)
+    return CUBE_PER_EXTENT * (camera_extent(camera_centers(views)) or TYPICAL_EXTENT)
 
 
 def cube_mismatch_reason(views: Sequence[View], half_extent: float) -> str | None:
@@ -120,6 +119,19 @@ DEPTH_PER_EXTENT = 20.0  # Median depth of the points, in extents, beyond which 
 ROUNDING = 1e-8  # Relative error of a position written with eight digits
 # Extent of the cameras, in median depths of the points, below which it does not set the unit
 NEGLIGIBLE = 1e-3
+
+
+def camera_centers(views: Sequence[View]) -> np.ndarray:
+    """Return the camera positions (V, 3) in the world."""
+    return np.array([camera_center(view.cam_from_world) for view in views])
+
+
+def scene_extent(views: Sequence[View]) -> float:
+    """Return ``camera_extent`` of the ``views``; 1 if all cameras share one position.
+
+    Learning rates and size thresholds are relative to it.
+    """
+    return camera_extent(camera_centers(views)) or 1.0
 
 
 def camera_extent(centers: np.ndarray) -> float:

@@ -28,7 +28,7 @@ from dyngs.core.conventions import SH_C0, num_sh_terms
 from dyngs.data.capture import Capture, View
 from dyngs.data.scene_space import (
     MIN_VIEWS,
-    camera_extent,
+    camera_centers,
     cube_half_side,
     cube_mismatch_reason,
     sample_points_in_frusta,
@@ -76,45 +76,8 @@ class InitialValues:
                 return InitialValues()
 
 
-@dataclass(frozen=True)
-class SceneGeometry:
-    """Cameras, points and extent of a capture, in scene units."""
-
-    views: Sequence[View]
-    points: np.ndarray | None = None  # (P, 3) sparse points, or None
-    points_rgb: np.ndarray | None = None
-    # By the convention of its format the scene lies around the origin (Blender scenes).
-    around_origin: bool = False
-    world_scale: float = 1.0  # as ``Capture.world_scale``
-
-    @property
-    def camera_centers(self) -> np.ndarray:
-        poses = np.stack([view.cam_from_world for view in self.views])
-        return -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
-
-    @property
-    def extent(self) -> float:
-        """1.1 times the largest distance of a camera to the mean camera position.
-
-        Learning rates and size thresholds are relative to it. 1 if all cameras share one position.
-        """
-        return camera_extent(self.camera_centers) or 1.0
-
-
-def scene_geometry(capture: Capture) -> SceneGeometry:
-    """Return the scene geometry of a capture."""
-    points = capture.points
-    return SceneGeometry(
-        views=capture.splits["train"],
-        points=None if points is None else points.xyz,
-        points_rgb=None if points is None else points.rgb,
-        around_origin=capture.format in AROUND_ORIGIN,
-        world_scale=capture.world_scale,
-    )
-
-
 def initial_gaussians(
-    scene: SceneGeometry,
+    capture: Capture,
     options: PointsInit | RandomInit | SceneInit,
     start: InitialValues,
     sh_degree: int,
@@ -126,10 +89,11 @@ def initial_gaussians(
     Without points it samples that cube, if the format places scenes around the origin, else the
     view frusta.
     """
-    if options.kind != "random" and scene.points is not None and scene.points_rgb is not None:
-        finite = np.isfinite(scene.points).all(axis=1)
-        xyz = torch.from_numpy(scene.points[finite].astype(np.float64))
-        base = (torch.from_numpy(scene.points_rgb[finite].astype(np.float64)) / 255 - 0.5) / SH_C0
+    points = capture.points
+    if options.kind != "random" and points is not None:
+        finite = np.isfinite(points.xyz).all(axis=1)
+        xyz = torch.from_numpy(points.xyz[finite].astype(np.float64))
+        base = (torch.from_numpy(points.rgb[finite].astype(np.float64)) / 255 - 0.5) / SH_C0
         if len(xyz) > start.max_gaussians:
             chosen = (
                 torch.randperm(len(xyz), generator=generator, device="cpu")[: start.max_gaussians]
@@ -140,12 +104,12 @@ def initial_gaussians(
             base = base[chosen]
         if len(xyz) > 0:
             return _create_isotropic(xyz, base, start, sh_degree)
-    xyz, base = _random_points(scene, options, start.max_gaussians, generator)
+    xyz, base = _random_points(capture, options, start.max_gaussians, generator)
     return _create_isotropic(xyz, base, start, sh_degree)
 
 
 def _random_points(
-    scene: SceneGeometry,
+    capture: Capture,
     options: PointsInit | RandomInit | SceneInit,
     max_points: int,
     generator: torch.Generator,
@@ -153,15 +117,18 @@ def _random_points(
     """Sample positions (N, 3) float64 and base colour coefficients (N, 3) just above mid grey
     (3DGS)."""
     count = min(options.num_random, max_points)
-    half_extent = cube_half_side(options.half_extent, scene.views, scene.world_scale)
+    views = capture.splits["train"]
+    half_extent = cube_half_side(options.half_extent, views, capture.world_scale)
+    # by the convention of its format the scene lies around the origin
+    around_origin = capture.format in AROUND_ORIGIN
     if options.kind == "random" or (
-        scene.around_origin and cube_mismatch_reason(scene.views, half_extent) is None
+        around_origin and cube_mismatch_reason(views, half_extent) is None
     ):
         xyz = (
             torch.rand((count, 3), generator=generator, dtype=torch.float64, device="cpu") * 2 - 1
         ) * half_extent
     else:
-        xyz = _sample_frusta(scene.views, count, generator)
+        xyz = _sample_frusta(views, count, generator)
     return xyz, torch.rand((count, 3), generator=generator, dtype=torch.float64, device="cpu") / 255
 
 
@@ -224,8 +191,8 @@ def load_or_create_gaussians(run: StartContext) -> Gaussians:
         return run.first.gaussians
     config = run.config
     start = InitialValues.for_strategy(run.uncapped.strategy)
-    where = scene_geometry(run.capture)
-    return initial_gaussians(where, config.init, start, config.stored_sh_degree, run.generator)
+    degree = config.stored_sh_degree
+    return initial_gaussians(run.capture, config.init, start, degree, run.generator)
 
 
 def build_colour_training(
@@ -259,9 +226,8 @@ def build_densifier(run: StartContext) -> Densifier:
             options = strategy.model_copy(
                 update={"grad_threshold": grad_threshold(strategy, steps)}
             )
-            center = torch.from_numpy(
-                scene_geometry(run.capture).camera_centers.mean(axis=0)
-            ).float()
+            centers = camera_centers(run.capture.splits["train"])
+            center = torch.from_numpy(centers.mean(axis=0)).float()
             schedule = replace(
                 densify_schedule(strategy, steps, on_white),
                 prunes_to_end=run.config.colour.opacity_entropy > 0,

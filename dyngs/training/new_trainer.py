@@ -15,9 +15,9 @@ from dyngs.core.errors import log_info, log_warning
 from dyngs.data.capture import Capture
 from dyngs.data.loader import ImageLoader, default_decoding_threads
 from dyngs.data.read import read_capture, require_images
-from dyngs.data.scene_space import cube_half_side, cube_mismatch_reason
+from dyngs.data.scene_space import cube_half_side, cube_mismatch_reason, scene_extent
 from dyngs.data.times import evenly_spaced
-from dyngs.gaussians.initialization import InitialGaussians, scene_geometry
+from dyngs.gaussians.initialization import InitialGaussians
 from dyngs.gaussians.model import GaussianModel
 from dyngs.models.kind import HasMotion, StartContext, find_kind
 from dyngs.models.model import Correction, Loss
@@ -89,7 +89,7 @@ def build_trainer(
     if not priors.masks:
         images = images.without_motion_masks()
     background = resolve_background(config, capture)
-    extent = scene_geometry(capture).extent
+    extent = scene_extent(capture.splits["train"])
     early = _early_alpha_fraction(config, capture, images, background)
 
     def parts(config: Config) -> TrainerParts:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dyngs.config import DefaultStrategy, McmcStrategy, PointsInit, RandomInit
-from dyngs.data.capture import View
+from dyngs.data.capture import Capture, PointCloud, View
 from dyngs.data.geometry import count_visible_views, pinhole_matrix
+from dyngs.data.scene_space import scene_extent
 from dyngs.gaussians.initialization import (
     InitialValues,
-    SceneGeometry,
     initial_gaussians,
     mean_squared_neighbour_distance,
 )
@@ -46,13 +47,18 @@ def _generator(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-def _with_points(xyz: np.ndarray) -> SceneGeometry:
-    return SceneGeometry(_views(), xyz, np.full((len(xyz), 3), 255, np.uint8))
+def _capture(views: list[View], file_format: str = "colmap") -> Capture:
+    return Capture(Path(), file_format, {"train": tuple(views)})
+
+
+def _with_points(xyz: np.ndarray) -> Capture:
+    points = PointCloud(xyz, np.full((len(xyz), 3), 255, np.uint8))
+    return replace(_capture(_views()), points=points)
 
 
 def test_extent_is_the_published_one() -> None:
-    assert SceneGeometry(_views()).extent == pytest.approx(1.1 * 4.0)
-    assert SceneGeometry(_views()[:1]).extent == 1.0
+    assert scene_extent(_views()) == pytest.approx(1.1 * 4.0)
+    assert scene_extent(_views()[:1]) == 1.0
 
 
 def test_points_give_their_published_start() -> None:
@@ -92,11 +98,11 @@ def test_neighbour_distance_equals_brute_force(count: int, seed: int) -> None:
     ("scene", "options", "half"),
     [
         (_with_points(np.ones((9, 3))), RandomInit(num_random=4000, half_extent=2.0), 2.0),
-        (SceneGeometry(_views(), around_origin=True), PointsInit(num_random=4000), 1.1),
+        (_capture(_views(), "blender"), PointsInit(num_random=4000), 1.1),
     ],
 )
 def test_random_points_fill_their_cube(
-    scene: SceneGeometry, options: PointsInit | RandomInit, half: float
+    scene: Capture, options: PointsInit | RandomInit, half: float
 ) -> None:
     gaussians = initial_gaussians(scene, options, InitialValues(), 1, _generator())
     assert len(gaussians) == 4000
@@ -114,13 +120,13 @@ def test_random_points_lie_in_frusta(
     """All lie in three images or more, most near the common focus of the cameras, for any scene
     origin.
     """
-    scene = SceneGeometry(_views(offset), around_origin=by_convention)
+    scene = _capture(_views(offset), "blender" if by_convention else "colmap")
     gaussians = initial_gaussians(
         scene, PointsInit(num_random=2000), InitialValues(), 1, _generator()
     )
     xyz = gaussians.means.double().numpy()
     assert len(xyz) == 2000
-    assert count_visible_views(xyz, scene.views).min() >= 3
+    assert count_visible_views(xyz, scene.splits["train"]).min() >= 3
     distances = np.linalg.norm(xyz - offset, axis=1)
     assert np.median(distances) < 2.0
     assert float((gaussians.base_rgb - 0.5).abs().max()) < 0.28209479177387814 / 255 + 1e-6

@@ -40,7 +40,6 @@ from dyngs.gaussians.initialization import (
     build_densifier,
     initial_gaussians,
     load_or_create_gaussians,
-    scene_geometry,
 )
 from dyngs.gaussians.model import GaussianModel, SceneTraining
 from dyngs.gaussians.optimizer import AdamState
@@ -74,9 +73,7 @@ def _initialize_at_points(run: StartContext, model: BgTriangleModel) -> tuple[Pa
     """Create randomly oriented triangles at the initial points; return them and the scene's half
     side."""
     values = InitialValues(max_gaussians=min(MAX_INITIAL, model.max_triangles))
-    first = initial_gaussians(
-        scene_geometry(run.capture), run.config.init, values, 0, run.generator
-    )
+    first = initial_gaussians(run.capture, run.config.init, values, 0, run.generator)
     ends = first.means.quantile(torch.tensor([INNER, 1 - INNER], device="cpu"), dim=0)
     unit = float((ends[1] - ends[0]).max()) / 2
     if not unit > 0:
