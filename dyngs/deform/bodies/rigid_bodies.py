@@ -248,16 +248,9 @@ def _search_windows(frames: Frames, basis: np.ndarray) -> list[tuple[int, np.nda
         turns = basis[:, first : first + size - 1].copy()
         turns[2:] /= turns[2:].sum(1).max()
         score, numbers = _minimise(part, turns)
-        random_disagreement = float(
-            np.concatenate([colors for _, colors in part]).var(axis=0).sum()
-        )
-        windows.append(
-            (
-                score / max(random_disagreement, 1e-6),
-                first,
-                integrate_rotations(numbers[None], turns)[0],
-            )
-        )
+        variance = float(np.concatenate([colors for _, colors in part]).var(axis=0).sum())
+        rotations = integrate_rotations(numbers[None], turns)[0]
+        windows.append((score / max(variance, 1e-6), first, rotations))
     return [start[1:] for start in sorted(windows, key=lambda start: start[:2])[:FOLLOWED]]
 
 
@@ -334,16 +327,10 @@ def _best_candidate(
         return center
     tried = around @ center
     place = rotated_cells(tried, normals, FINE)
-    apart = np.minimum(
-        sum(
-            (mean.take(place) - c) ** 2
-            for mean, c in zip(_mean_colours(seen), colors.T, strict=True)
-        ),
-        CUT,
-    )
-    return tried[
-        np.argmin(np.where((seen[3] >= LEAST_PIXELS).take(place), apart, UNKNOWN).mean(1) + pull)
-    ]
+    differences = _mean_colours(seen).T[place] - colors
+    apart = np.minimum((differences**2).sum(2), CUT)
+    is_known = (seen[3] >= LEAST_PIXELS)[place]
+    return tried[np.argmin(np.where(is_known, apart, UNKNOWN).mean(1) + pull)]
 
 
 def _refine(frames: Frames, rotations: np.ndarray) -> np.ndarray:
