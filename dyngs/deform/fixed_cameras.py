@@ -110,12 +110,12 @@ def detect_changes(images: np.ndarray) -> np.ndarray:
 
 def _drop_specks(differs: np.ndarray, certainty: np.ndarray) -> np.ndarray:
     """Drop small regions, and regions where ``certainty`` is below ``HYSTERESIS`` everywhere."""
+    from scipy import ndimage
     from skimage.measure import label
 
     labels: np.ndarray = np.asarray(label(differs, connectivity=1))
     sizes = np.bincount(labels.ravel())
-    peaks = np.zeros(len(sizes))
-    np.maximum.at(peaks, labels.ravel(), certainty.ravel())
+    peaks = ndimage.maximum(certainty, labels, np.arange(len(sizes)))
     kept = (sizes >= MIN_PIXELS) & (peaks > HYSTERESIS)
     kept[0] = False
     return kept[labels]
