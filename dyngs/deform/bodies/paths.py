@@ -173,19 +173,17 @@ def render_frame_stack(
             rgb = torch.where(small.mask[..., None] > 0, rgb, drawn.rgb[0])
             own_alpha = torch.where(small.mask > 0, own_alpha, alpha)
         shown = {
+            "times": torch.tensor(small.time or 0.0, dtype=torch.float64, device="cpu"),
             "images": rgb,
             "static": drawn.rgb[0],
             "depths": depth,
             "alphas": own_alpha,
             "static_alphas": alpha,
-        }
-        camera = {
             "poses": small.cameras.cam_from_world[0].double(),
             "intrinsics": small.cameras.intrinsics[0].double(),
         }
-        for name, x in (shown | camera).items():
+        for name, x in shown.items():
             parts.setdefault(name, []).append(x.cpu().numpy())
-        parts.setdefault("times", []).append(np.array(small.time or 0.0))
     return FrameStack(**{name: np.stack(x) for name, x in parts.items()})
 
 
@@ -238,10 +236,8 @@ class DiscContrast:
         away = np.hypot(y, x).astype(np.float32)
         kernels = np.empty((SIZES, shape[0], shape[1] // 2 + 1), np.complex64)
         for k, radius in enumerate(self.radii):
-            disc = np.clip(radius - away + 0.5, 0, 1)
-            ring = np.clip(1.6 * radius - away + 0.5, 0, 1) - np.clip(
-                1.15 * radius - away + 0.5, 0, 1
-            )
+            disc, inner, outer = (np.clip(x * radius - away + 0.5, 0, 1) for x in (1, 1.15, 1.6))
+            ring = outer - inner
             kernels[k] = np.asarray(rfft2(disc / disc.sum() - ring / ring.sum()))
         # (T, S, H, W)
         self.values: np.ndarray = np.empty((len(maps), SIZES, height, width), np.float32)
@@ -292,17 +288,13 @@ def find_paths(frame_stack: FrameStack, maps: np.ndarray) -> list[Path]:
     if len(frame_stack) <= 2 * HALF_WINDOW:
         return []
     discs = DiscContrast(maps)
-    chains = _link_chains(
-        _fit_segments(frame_stack, discs, np.random.default_rng(0)), len(frame_stack)
-    )
-    followed = [
-        path
-        for path in (_track_path(frame_stack, discs, chain) for chain in chains)
-        if path.support > MIN_SUPPORT
-    ]
+    segments = _fit_segments(frame_stack, discs, np.random.default_rng(0))
+    chains = _link_chains(segments, len(frame_stack))
+    followed = [_track_path(frame_stack, discs, chain) for chain in chains]
     distinct: list[Path] = []
     for path in sorted(
-        followed, key=lambda path: _colour_variation(frame_stack, discs, path) - path.support
+        (path for path in followed if path.support > MIN_SUPPORT),
+        key=lambda path: _colour_variation(frame_stack, discs, path) - path.support,
     ):
         if not any(path.is_like(other) for other in distinct):
             distinct.append(path)
