@@ -95,9 +95,7 @@ class TimeWindow:
 
     times: Sequence[float]
     initial_fraction: float
-    motion_start: int
-    window_grows_from: int
-    window_full_at: int
+    schedule: DeformSchedule
     _limits: dict[int, tuple[float, float]] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )
@@ -112,9 +110,8 @@ class TimeWindow:
             len(self.time_offsets),
             max(MIN_WINDOW_VIEWS, math.ceil(self.initial_fraction * len(self.time_offsets))),
         )
-        progress = (step - self.window_grows_from) / max(
-            self.window_full_at - self.window_grows_from, 1
-        )
+        first, last = self.schedule.window_grows_from, self.schedule.window_full_at
+        progress = (step - first) / max(last - first, 1)
         return start + int(min(max(progress, 0.0), 1.0) * (len(self.time_offsets) - start))
 
     def reach(self, step: int) -> float:
@@ -131,7 +128,7 @@ class TimeWindow:
         """Return whether ``step`` trains on ``time``; frontier steps train on the newest times
         only."""
         # ``bounds`` is rounded and could exclude the outermost times.
-        if step <= self.motion_start:
+        if step <= self.schedule.coarse_end:
             return True
         if step not in self._limits:  # cached, because all views call this
             oldest = (
@@ -148,7 +145,7 @@ class TimeWindow:
         """Return whether ``step`` trains on the newest views only: every other step while it
         grows."""
         return (
-            self.window_grows_from < step < self.window_full_at
+            self.schedule.window_grows_from < step < self.schedule.window_full_at
             and step % 2 == 0
             and self.num_views(step) < len(self.time_offsets)
         )

@@ -296,13 +296,8 @@ class DynamicTraining(SceneTraining[DynamicScene]):
     def _set_time_window(self, all_times: bool) -> None:
         """Set the time window: all times at once if ``all_times``, else growing from the middle."""
         first = 1.0 if all_times or self._has_lifetimes else self.options.time_window
-        phases = (
-            self.schedule.coarse_end,
-            self.schedule.window_grows_from,
-            self.schedule.window_full_at,
-        )
         self._all_times = all_times
-        self._window = TimeWindow(self.capture.times, first, *phases)
+        self._window = TimeWindow(self.capture.times, first, self.schedule)
 
     def _find_bodies(self, static: Gaussians) -> Bodies | None:
         """Find rigid bodies in the images of one moving camera."""

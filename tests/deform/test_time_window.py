@@ -6,9 +6,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dyngs.deform.schedule import FRONTIER_VIEWS, MIN_WINDOW_VIEWS, TimeWindow
+from dyngs.deform.schedule import FRONTIER_VIEWS, MIN_WINDOW_VIEWS, DeformSchedule, TimeWindow
+from dyngs.gaussians.schedule import RateSchedule
 
 OPENS, FULL = 10, 50
+SCHEDULE = DeformSchedule(OPENS, OPENS, FULL, FULL, (), RateSchedule(100))
 ODD_STEPS = (OPENS + 1, 21, 35, FULL - 1)
 EVEN_STEPS = (OPENS + 2, 20, 34, FULL - 2)
 clips = st.lists(st.floats(0, 1), min_size=1, max_size=60)
@@ -23,7 +25,7 @@ def held(window: TimeWindow, times: list[float], step: int) -> list[float]:
 def test_window_grows_to_all_views(times: list[float], first: float) -> None:
     """For any times: unsorted, repeated, constant, at one end. Looked at in the steps that train on
     all of it."""
-    window = TimeWindow(times, first, OPENS, OPENS, FULL)
+    window = TimeWindow(times, first, SCHEDULE)
     before: list[float] = []
     for step in (*ODD_STEPS, FULL, FULL + 1, 10**6):
         now = held(window, times, step)
@@ -41,7 +43,7 @@ def test_window_grows_to_all_views(times: list[float], first: float) -> None:
 @given(clips, st.floats(0, 1), st.sampled_from(EVEN_STEPS))
 def test_every_other_step_is_for_the_newest(times: list[float], first: float, step: int) -> None:
     """The newest views are the outermost ones of the window and those at the same times."""
-    window = TimeWindow(times, first, OPENS, OPENS, FULL)
+    window = TimeWindow(times, first, SCHEDULE)
     newest = held(window, times, step)
     inside = sorted(
         (t for t in times if abs(t - 0.5) <= window.reach(step)), key=lambda t: abs(t - 0.5)
