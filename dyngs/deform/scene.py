@@ -42,8 +42,9 @@ class DynamicScene(GaussianScene):
         own = select_prefix(tensors, "field")
         std = restore_filter(tensors, count)
         times = restore_times(tensors)
+        static = DynamicScene(gaussians=gaussians, training_times=times, filter_std=std)
         if not own:
-            return DynamicScene(gaussians=gaussians, training_times=times, filter_std=std)
+            return static
         masks = VisibilityMasks.from_state(select_prefix(tensors, "masks"), count)
         rows = tensors.get("rows", torch.arange(count, device=gaussians.means.device))
         require_ascending("rows", require_indices("rows", rows, (None,), count))
@@ -51,14 +52,7 @@ class DynamicScene(GaussianScene):
         if "left_quats" in own:
             left = require_tensor("left_quats", own["left_quats"], (len(rows), 4))
             gaussians = gaussians.replace(quats=gaussians.quats.index_copy(0, rows, left))
-        return DynamicScene(
-            gaussians=gaussians,
-            training_times=times,
-            field=field,
-            moving=rows,
-            masks=masks,
-            filter_std=std,
-        )
+        return replace(static, gaussians=gaussians, field=field, moving=rows, masks=masks)
 
     @property
     def times(self) -> tuple[float, ...]:
@@ -118,11 +112,9 @@ class DynamicScene(GaussianScene):
 
         With ``detach`` only the field gets gradients, not the canonical Gaussians.
         """
-        if self.field is None:
-            raise ValueError("the scene has no deformation field")
-        part = self._select(
-            self.gaussians.detach() if detach else self.gaussians, self._active(time)
-        )
+        assert self.field is not None
+        gaussians = self.gaussians.detach() if detach else self.gaussians
+        part = self._select(gaussians, self._active(time))
         return part.deform(self.field, time, in_training=True, eye=eye)
 
     def apply_edit(self, edit: TopologyEdit) -> DynamicScene:

@@ -233,19 +233,19 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         """Add the Gaussians that motion starts with; None if a static model explains all images."""
         if step != self.schedule.coarse_end:
             return None
-        now = scene.gaussians
+        now = scene.gaussians.detach()
         errors = self.capture.static_errors(lambda _: now)
         floor = self.options.motion_threshold
         threshold = min(max(otsu_threshold(errors.typical), floor), SURELY_MOVING * floor)
         rows = torch.nonzero(errors.typical > threshold)[:, 0]
-        first = self._find_initial_motion(now.detach())
+        first = self._find_initial_motion(now)
         has_motion = self._has_motion(errors) or bool(first.timed_gaussians)
         if self.options.select_moving and not has_motion:
             return None
-        bodies = self._find_bodies(now.detach())
-        added, start = self._build_added(now.detach(), rows, first, bodies)
+        bodies = self._find_bodies(now)
+        added, start = self._build_added(now, rows, first, bodies)
         message = first.message if bodies is None else bodies.message
-        result = replace(with_gaussians(now.detach(), added), message=message)
+        result = replace(with_gaussians(now, added), message=message)
         if start is not None:
             result.changes["logit_opacities"][rows] = start.logits.to(rows.device)
         gaussians = Gaussians(**result.changes)
