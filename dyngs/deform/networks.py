@@ -44,13 +44,8 @@ class Hexplane(DeformationField):
         rows = min(max(2, math.ceil(setup.num_times / options.times_per_row)), MAX_KEY_TIMES)
         for level, multiplier in enumerate(options.levels):
             side = options.resolution * multiplier
-            low, high = SPACE_RANGE
-            space = (
-                torch.rand((3, side, side, options.channels), generator=generator, device="cpu")
-                * (high - low)
-                + low
-            )
-            tensors[f"space{level}"] = space
+            space = torch.empty(3, side, side, options.channels, device="cpu")
+            tensors[f"space{level}"] = space.uniform_(*SPACE_RANGE, generator=generator)
             tensors[f"time{level}"] = torch.ones(3, rows, side, options.channels, device="cpu")
         hidden = [options.width] * options.depth + [options.width * len(head_sizes(options))]
         num_features = options.channels * len(options.levels)
