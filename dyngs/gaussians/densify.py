@@ -144,8 +144,7 @@ class DefaultDensifier(Densifier):
         magnitude = gradient.abs()
         counts = (magnitude > 0) & magnitude.isfinite()
         added = torch.stack([torch.where(counts, magnitude, 0.0), counts.to(magnitude.dtype)])
-        same = self.time_sums.shape == added.shape
-        self.time_sums = self.time_sums + added if same else added
+        self.time_sums = _accumulated(self.time_sums, added)
 
     def tallies(self, step: int, count: int) -> list[Tensor]:
         if not self.needs_gradient(step):
@@ -164,7 +163,9 @@ class DefaultDensifier(Densifier):
             self.sums = torch.zeros(2, 0, device="cpu")
             self.time_sums = self.sums
         elif self.schedule.prunes_at(step):
-            return prune_transparent(parameters, self.options.prune_opacity)
+            kept = parameters.opacities >= self.options.prune_opacity
+            is_due = bool(kept.any()) and not bool(kept.all())
+            return EditResult(TopologyEdit.select(kept)) if is_due else None
         elif resets:
             result = EditResult(None)
         else:
@@ -197,11 +198,9 @@ class DefaultDensifier(Densifier):
 
     def _accumulate_step(self) -> None:
         """Accumulate the 2D gradient norms of this step."""
-        if not self._step_sums.shape[1]:
-            return
-        same = self.sums.shape == self._step_sums.shape
-        self.sums = self.sums + self._step_sums if same else self._step_sums
-        self._step_sums = self._step_sums[:, :0]
+        if self._step_sums.shape[1]:
+            self.sums = _accumulated(self.sums, self._step_sums)
+            self._step_sums = self._step_sums[:, :0]
 
     def _densify(self, step: int, parameters: Gaussians, generator: torch.Generator) -> EditResult:
         distance = (parameters.means - self.center).norm(dim=1)
@@ -215,6 +214,11 @@ class DefaultDensifier(Densifier):
             score = torch.maximum(score, self.options.grad_threshold * time_score)
         plan = plan_edit(parameters, score, self.options, reference_length, max_scale)
         return apply_plan(parameters, plan, generator)
+
+
+def _accumulated(sums: Tensor, added: Tensor) -> Tensor:
+    """Return ``sums`` plus ``added`` (2, N); without ``sums`` of another number of Gaussians."""
+    return sums + added if sums.shape == added.shape else added
 
 
 def _stored_sums(state: dict[str, Tensor], *names: str) -> Tensor:
@@ -273,13 +277,6 @@ def plan_edit(
     if not bool((kept | split).any()):
         kept[parameters.logit_opacities.nan_to_num(nan=-math.inf).argmax()] = True
     return EditPlan(kept, cloned, split)
-
-
-def prune_transparent(parameters: Gaussians, min_opacity: float) -> EditResult | None:
-    """Remove Gaussians below ``min_opacity``; None if there are none, or only such."""
-    kept = parameters.opacities >= min_opacity
-    is_due = bool(kept.any()) and not bool(kept.all())
-    return EditResult(TopologyEdit.select(kept)) if is_due else None
 
 
 def apply_plan(parameters: Gaussians, plan: EditPlan, generator: torch.Generator) -> EditResult:
