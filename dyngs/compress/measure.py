@@ -147,16 +147,16 @@ def measure_precision(
 
 
 def quantize_tensors(
-    exact: Mapping[str, Tensor], steps: Mapping[str, float], names: Iterable[str] | None = None
+    exact: Mapping[str, Tensor], steps: Mapping[str, float], names: Iterable[str]
 ) -> dict[str, Tensor]:
-    """Return the tensors with those of ``names`` (None: all) as a file with these steps holds them.
+    """Return the tensors with those of ``names`` as a file with these steps holds them.
 
     ``exact``: from ``tensors_to_store``, and the coarseness of the Gaussians if they have any.
     ``names``: of the tensors that are rounded.
     """
     coarseness = exact[COARSENESS].numpy() if COARSENESS in exact else None
     found = dict(exact)
-    for name in exact if names is None else names:
+    for name in names:
         coding = choose_coding(name, exact[name], steps, by_coarseness=coarseness is not None)
         found[name] = round_trip(exact[name], coding, coarseness)
     return found

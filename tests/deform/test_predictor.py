@@ -200,7 +200,9 @@ def test_a_stored_scene_keeps_each_number_of_the_rotations() -> None:
     scene = scene_of(trained_field())
     exact = tensors_to_store(scene)
     steps = {"gaussians.quats": 2**-12, "model.field.left_quats": 2**-12}
-    tensors = to_checkpoint_tensors(quantize_tensors(exact, dict.fromkeys(exact, 0.0) | steps))
+    tensors = to_checkpoint_tensors(
+        quantize_tensors(exact, dict.fromkeys(exact, 0.0) | steps, exact)
+    )
     stored = DynamicScene.from_state(
         DynamicModel(deform=OPTIONS),
         Gaussians.stored(select_prefix(tensors, "gaussians")),
