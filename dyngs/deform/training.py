@@ -54,12 +54,10 @@ def measure_motion(
     """
     picked = torch.linspace(0, len(times) - 1, min(len(times), 24), device="cpu").round().long()
     samples = [field.offsets(gaussians.means, times[i]) for i in picked.tolist()]
-    heads = [
-        [x for x in head if x is not None]
-        for head in zip(*(vars(s).values() for s in samples), strict=True)
-    ]
-    means = [torch.stack(head).mean(0) if head else None for head in heads]
-    mean = Offsets(*means)  # type: ignore[arg-type]
+    heads = [name for name, x in vars(samples[0]).items() if x is not None]
+    mean = Offsets(
+        **{name: torch.stack([getattr(x, name) for x in samples]).mean(0) for name in heads}
+    )
     longest = gaussians.scales.amax(1)
     score = torch.zeros_like(longest)
     no_rotation = torch.zeros_like(gaussians.quats)
