@@ -51,9 +51,7 @@ def apply_affine_colour(
     affine = affine.to(rgb.device)
     matrix = affine[:, :3]
     offset = affine[:, 3]
-    if image.alpha is None:
-        return torch.addmm(offset, rgb.reshape(-1, 3), matrix.T).reshape(rgb.shape)
-    through = rendering.transmittance[0][..., None]
+    through = rgb.new_zeros(()) if image.alpha is None else rendering.transmittance[0][..., None]
     behind = through * background
     shown = torch.addmm(
         offset - offset * through.reshape(-1, 1), (rgb - behind).reshape(-1, 3), matrix.T
@@ -82,14 +80,10 @@ def fit_affine_colour(
     ridge = total.clamp_min(1) * torch.diag_embed(
         MIXING_RIDGE + (GAIN_RIDGE - MIXING_RIDGE) * is_gain
     )
-    left_out: list[Tensor] = []
     for _ in range(ROUNDS):
-        before = left_out
         left_out = [
             one.edge_weight * (one.saturated & (one.edge[:, :4] @ affine.T > 1)) for one in sums
         ]
-        if before and all(torch.equal(x, y) for x, y in zip(left_out, before, strict=True)):
-            break  # converged: the same equations again
         products = torch.stack([one.products for one in sums]).sum(0).expand(3, 4, 7)
         for one, weights in zip(sums, left_out, strict=True):
             products = products - torch.einsum("pi,pc,pj->cij", one.edge[:, :4], weights, one.edge)
