@@ -74,14 +74,10 @@ def apply_choice(trainer: GaussianTrainer, choice: PruneChoice, scores: Tensor) 
     trainer.apply(TrainingEdit(config=config.model_copy(update=changed)))
     trainer.apply(build_removal_edit(trainer, scores if choice.fraction else None))
     if choice.harmonics:
-        _drop_harmonics(trainer, choice.harmonics)
-
-
-def _drop_harmonics(trainer: GaussianTrainer, tolerance: float) -> None:
-    usable = [i for i in range(len(trainer.images)) if i not in trainer.held_out]
-    judged = usable[HELD_OUT_EVERY // 2 :: HELD_OUT_EVERY] or usable[:1]
-    seen = [i for i in usable if i not in judged] or judged
-    trainer.model.drop_harmonics(seen, judged, trainer.done, tolerance)
+        usable = [i for i in range(len(trainer.images)) if i not in trainer.held_out]
+        judged = usable[HELD_OUT_EVERY // 2 :: HELD_OUT_EVERY] or usable[:1]
+        seen = [i for i in usable if i not in judged] or judged
+        trainer.model.drop_harmonics(seen, judged, trainer.done, choice.harmonics)
 
 
 HELD_OUT_FRACTION = 1 / 8
