@@ -19,6 +19,7 @@ from functools import cache, cached_property
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from dyngs.core.conventions import SH_C0
 from dyngs.deform.bodies.field import BodyField, BodyRestPose
@@ -448,28 +449,30 @@ class Bodies:
         """Build the body field around ``inner_field``; the bodies own the last moving Gaussians."""
         num_pieces = min(max(round(PIECES_PER_TIME * len(self.frame_stack)), 1), MAX_KEY_TIMES)
         basis = spline_basis(torch.from_numpy(self.frame_stack.times), num_pieces).numpy()
-        splines = {
-            "places": [_fit_spline(basis, body.path.centers) for body in self.bodies],
-            "quats": [_fit_spline(basis, _quats(body.rotation.rotations)) for body in self.bodies],
+        device = inner_field.setup.center.device
+
+        def tensor(values: Sequence[np.ndarray | float]) -> Tensor:
+            return torch.from_numpy(np.stack(values)).float().to(device)
+
+        learned = {
+            "places": tensor([_fit_spline(basis, x.path.centers) for x in self.bodies]),
+            "quats": tensor(
+                [_fit_spline(basis, _quats(x.rotation.rotations)) for x in self.bodies]
+            ),
         }
-        centers = np.stack([body.path.centers[len(self.frame_stack) // 2] for body in self.bodies])
+        middle = len(self.frame_stack) // 2
+        centers = tensor([x.path.centers[middle] for x in self.bodies])
+        radii = tensor([x.path.radius for x in self.bodies])
         counts = [len(seeds) for seeds in self.seeds]
         labels = torch.repeat_interleave(
             torch.tensor([inner_field.setup.num_moving - sum(counts), *counts], device="cpu")
         )
-        device = inner_field.setup.center.device
-        points = {
-            name: torch.from_numpy(np.stack(x)).float().to(device) for name, x in splines.items()
-        }
-        radii = torch.tensor([body.path.radius for body in self.bodies], device=device)
-        rest = BodyRestPose(
-            torch.from_numpy(centers).float().to(device), radii, (labels - 1).to(device)
-        )
+        rest = BodyRestPose(centers, radii, (labels - 1).to(device))
         albedo = torch.cat([seeds.sh[:, 0] + 0.5 / SH_C0 for seeds in self.seeds]).to(device)
         albedo = torch.cat([albedo.new_zeros(len(labels) - len(albedo), 3), albedo])
         # up direction of the cameras
-        up = torch.from_numpy(-self.frame_stack.poses[:, 1, :3].mean(0)).float().to(device)
-        return BodyField(inner_field, rest, points | {"albedo": albedo, "sun": up})
+        up = tensor(list(-self.frame_stack.poses[:, 1, :3].mean(0)))
+        return BodyField(inner_field, rest, learned | {"albedo": albedo, "sun": up})
 
 
 def find_bodies(frame_stack: FrameStack, limit: int, num_terms: int) -> Bodies | None:
