@@ -239,15 +239,13 @@ class GaussianModel(Model[GaussianScene]):
         generator = self._generator
         progress = self._rate_schedule.progress(step, since=self.training.means_decay_from)
         lr_means = means_rate(self._rates, progress, self._run.extent)
-        frozen = self.colours.frozen_harmonics
-        skip_unseen_rows = self.training.skip_unseen_rows(self._scene)
         frozen_mask = self.training.frozen_mask()
         self.densifier.add_time_gradient(step, self.training.time_gradient(self._scene))
         bad = self._optimizer.step(
             step,
             lr_means,
-            frozen_harmonics=frozen,
-            skip_unseen_rows=skip_unseen_rows,
+            frozen_harmonics=self.colours.frozen_harmonics,
+            skip_unseen_rows=self.training.skip_unseen_rows(self._scene),
             frozen_mask=frozen_mask,
         )
         bad = bad + self.colours.optimize(step) + self.training.optimize(self._scene, step)

@@ -207,7 +207,14 @@ class Parameters:
     def reorder(self, values: Mapping[str, Tensor], source: Tensor, is_new: Tensor) -> Parameters:
         """Return the parameters with new ``values`` for some tensors and moments gathered from
         ``source``."""
-        return self._with(values, lambda x: _moments_of(x, source, is_new))
+
+        def moments(x: Tensor) -> Tensor:
+            # The source of new rows may not exist.
+            moved = x.new_zeros(len(source), *x.shape[1:])
+            moved[~is_new] = x[source[~is_new]]
+            return moved
+
+        return self._with(values, moments)
 
     def values(self) -> dict[str, Tensor]:
         return {name: x.detach() for name, x in self._tensors.items()}
@@ -255,14 +262,6 @@ class Parameters:
 
 def _leaf(x: Tensor) -> Tensor:
     return x.detach().contiguous().requires_grad_()
-
-
-def _moments_of(x: Tensor, source: Tensor, is_new: Tensor) -> Tensor:
-    """Gather moments ``x`` from rows ``source``; those of new rows are 0, their source may not
-    exist."""
-    moved = x.new_zeros(len(source), *x.shape[1:])
-    moved[~is_new] = x[source[~is_new]]
-    return moved
 
 
 ADAM_EPS = 1e-15
@@ -329,15 +328,24 @@ class GaussianOptimizer:
         """
         rows = None if frozen_mask.rows is None else ~frozen_mask.rows
         if skip_unseen_rows is not None:
-            seen = self._rows_with_gradient()[skip_unseen_rows]
+            opacity_grad = self.parameters.logit_opacities.grad
+            means_grad = self.parameters.means.grad
+            assert opacity_grad is not None
+            assert means_grad is not None
+            # The gradient by opacity alone vanishes at full opacity.
+            seen = ((opacity_grad != 0) | seen_rows(means_grad))[skip_unseen_rows]
             rows = seen.new_ones(len(self.parameters)) if rows is None else rows
             rows[skip_unseen_rows] &= seen
+        # one per SH coefficient and channel, on the CPU
+        num_terms = self.parameters.sh.shape[1]
+        harmonics_rates = torch.full((num_terms, 3), self.options.lr_sh_rest, device="cpu")
+        harmonics_rates[0] = self.options.lr_sh_dc
         rates: dict[str, float | Tensor] = {
             "means": lr_means,
             "quats": self.options.lr_quats,
             "log_scales": self.options.lr_scales,
             "logit_opacities": self.options.lr_opacities,
-            "sh": self._harmonics_rates(),
+            "sh": harmonics_rates.reshape(-1),
         }
         if frozen_harmonics is not None and self.parameters.sh.grad is not None:
             self.parameters.sh.grad[frozen_harmonics, 1:] = 0
@@ -395,23 +403,6 @@ class GaussianOptimizer:
         optimizer = GaussianOptimizer(copies, self.options)
         optimizer._adam = AdamState.from_state(tensors, parameters.tensors())
         return optimizer
-
-    def _harmonics_rates(self) -> Tensor:
-        """Return (K * 3,) learning rates, one per SH coefficient and channel, on the CPU."""
-        rates = torch.full((self.parameters.sh.shape[1], 3), self.options.lr_sh_rest, device="cpu")
-        rates[0] = self.options.lr_sh_dc
-        return rates.reshape(-1)
-
-    def _rows_with_gradient(self) -> Tensor:
-        """Return (N,) bool, Gaussians with a gradient by opacity or mean.
-
-        Opacity alone does not suffice: its gradient vanishes at full opacity.
-        """
-        opacity_grad = self.parameters.logit_opacities.grad
-        means_grad = self.parameters.means.grad
-        assert opacity_grad is not None
-        assert means_grad is not None
-        return (opacity_grad != 0) | seen_rows(means_grad)
 
 
 def _as_leaves(tensors: dict[str, Tensor]) -> Gaussians:

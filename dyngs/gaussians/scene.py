@@ -172,7 +172,9 @@ class GaussianScene(Renderable):
         Raises:
             DyngsError: as ``dyngs.gaussians.rendering.render``.
         """
-        now = time if isinstance(time, GaussianTimeStep) else self.drawing_step(_time_value(time))
+        now = time
+        if not isinstance(now, GaussianTimeStep):
+            now = self.drawing_step(now.time if isinstance(now, TimeStep) else now)
         behind = self.background if background is None else background
         how = self.options if options is None else options
         device = now.gaussians.means.device
@@ -248,10 +250,6 @@ def require_gaussians(scene: Renderable, what: str) -> GaussianScene:
 def restore_scene(checkpoint: Checkpoint, model: ModelSection) -> GaussianScene:
     """Return the scene in a checkpoint of ``model``; see ``restore_model``."""
     return require_gaussians(restore_model(checkpoint, model), checkpoint.name)
-
-
-def _time_value(time: float | TimeStep | None) -> float | None:
-    return time.time if isinstance(time, TimeStep) else time
 
 
 def restore_appearance(scene: S, model: SceneModel, checkpoint: Checkpoint) -> S:
