@@ -259,11 +259,11 @@ class ControlNodes(DeformationField):
         device = self.setup.center.device
         after = torch.arange(1, last - high + 1, device=device)[:, None]
         before = torch.arange(low, 0, -1, device=device)[:, None]
+        ends = (high, -reach, slice(high + 1, None), after), (low, reach, slice(low), before)
         for x in self.parameters.values().values():
-            pace = (x[:, high] - x[:, high - reach]) / max(reach, 1)
-            x[:, high + 1 :] = x[:, high, None] + after * pace[:, None]
-            pace = (x[:, low] - x[:, low + reach]) / max(reach, 1)
-            x[:, :low] = x[:, low, None] + before * pace[:, None]
+            for edge, inward, outside, gaps in ends:
+                pace = (x[:, edge] - x[:, edge + inward]) / max(reach, 1)
+                x[:, outside] = x[:, edge, None] + gaps * pace[:, None]
 
     def offsets_of_nodes(self, time: float) -> Offsets:
         motion, values = spline_motion(self._heads(), time)

@@ -234,9 +234,8 @@ class Gaussians4D(DeformationField):
     @property
     def time_gradient(self) -> Tensor:
         """Gradient (M,) of the loss by the mean times, since the last update."""
-        gradient = self.parameters["times"].grad
-        zero = torch.zeros_like(self.parameters["times"])
-        return (zero if gradient is None else gradient)[:, 0]
+        times = self.parameters["times"]
+        return (torch.zeros_like(times) if times.grad is None else times.grad)[:, 0]
 
     def split(
         self, gaussians: Gaussians, rows: Tensor, generator: torch.Generator

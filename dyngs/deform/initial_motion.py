@@ -82,9 +82,8 @@ class _Frame:
         if not len(rows):
             return np.zeros((0, 3))
         drawn = generator.integers(len(rows), size=count)
-        pixels = np.stack([columns[drawn], rows[drawn], np.zeros(count)], 1)
+        pixels = np.stack([columns[drawn], rows[drawn], np.ones(count)], 1)
         pixels[:, :2] += generator.random((count, 2))
-        pixels[:, 2] = 1
         inverse = np.linalg.inv(self.projection[:, :3])
         rays = pixels @ inverse.T
         rays = np.where(np.abs(rays) < 1e-9, 1e-9, rays)
@@ -130,9 +129,7 @@ def find_initial_motion(
 
 def _frames_at(clips: Sequence[FixedCameraClip], time: float) -> list[_Frame]:
     frames: list[_Frame] = []
-    for one in clips:
-        if time not in one.times:
-            continue
+    for one in (clip for clip in clips if time in clip.times):
         i = one.times.index(time)
         pose = one.camera.cam_from_world[0].double().cpu().numpy()[:3]
         projection = one.camera.intrinsics[0].double().cpu().numpy() @ pose

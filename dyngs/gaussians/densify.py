@@ -261,9 +261,8 @@ def plan_edit(
         opaque = torch.ones_like(opaque)
         max_scale = math.inf
     survives = opaque & (scale <= max_scale)
-    wanted = opaque & (score >= options.grad_threshold)
+    wanted = opaque & (score >= options.grad_threshold) & options.grow
     large = scale > DENSE_FRACTION * reference_length
-    wanted = wanted if options.grow else torch.zeros_like(wanted)
     split = wanted & large & (scale / SPLIT_SHRINK <= max_scale)
     cloned = wanted & ~large & survives
     # A candidate adds one Gaussian. Splitting one that would otherwise be pruned adds two.

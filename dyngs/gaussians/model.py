@@ -254,7 +254,12 @@ class GaussianModel(Model[GaussianScene]):
             result = frozen_mask.exclude_from_edit(result, self._optimizer.parameters)
             result = self.training.split_in_time(self._scene, result, generator)
             self._apply(self._sort_by_morton_code(result))
-        self._perturb(lr_means)
+        means = self._optimizer.parameters.means.detach()
+        frozen = self.training.frozen_mask().rows
+        frozen_means = None if frozen is None else means[frozen]
+        self.densifier.perturb(self._optimizer.parameters, lr_means, generator)
+        if frozen_means is not None:
+            means[frozen] = frozen_means
         self._scene = self.training.after_step(self._scene, step, result is not None)
         scene_edit = self.training.edit_scene(self._scene, step)
         if scene_edit is not None:
@@ -267,15 +272,6 @@ class GaussianModel(Model[GaussianScene]):
         self._scene.clear_caches()
         text = "; ".join(text for text in messages if text) or None
         return UpdateResult(bad, text, self._optimizer.parameters is not before)
-
-    def _perturb(self, lr_means: float) -> None:
-        """Add the noise of the strategy to the means, except those of frozen Gaussians."""
-        rows = self.training.frozen_mask().rows
-        means = self._optimizer.parameters.means.detach()
-        kept = None if rows is None else means[rows]
-        self.densifier.perturb(self._optimizer.parameters, lr_means, self._generator)
-        if kept is not None:
-            means[rows] = kept
 
     def replace_scene(self, scene: GaussianScene) -> None:
         """Continue with ``scene``: same Gaussians with other motion, masks or render options."""

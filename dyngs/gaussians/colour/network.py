@@ -218,9 +218,7 @@ def robust_bounding_box(means: Tensor) -> Tensor:
     No half size is zero.
     """
     if not len(means):
-        return torch.stack(
-            [torch.zeros(3, device=means.device), torch.ones(3, device=means.device)]
-        )
+        return torch.tensor([[0.0] * 3, [1.0] * 3], device=means.device)
     ordered = means.detach().sort(dim=0).values
     last = len(ordered) - 1
     low = ordered[round(0.01 * last)]
