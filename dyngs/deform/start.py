@@ -11,6 +11,7 @@ from dyngs.core.errors import DyngsError
 from dyngs.data.capture import View
 from dyngs.data.times import evenly_spaced
 from dyngs.deform.bodies.paths import FrameStack, order_moving_camera, render_frame_stack
+from dyngs.deform.bodies.rigid_bodies import angles_deg
 from dyngs.deform.fixed_cameras import FixedCameraClip, build_fixed_camera_clip
 from dyngs.deform.keys import ControlNodesField, DynamicModel
 from dyngs.deform.kind import DYNAMIC, RATE_FACTOR
@@ -82,8 +83,7 @@ def is_clip(views: Sequence[View]) -> bool:
     if order is None or len(order) < 2:
         return False
     rotations = np.stack([views[i].cam_from_world[:3, :3] for i in order])
-    traces = np.einsum("nij,nij->n", rotations[1:], rotations[:-1])
-    angles = np.degrees(np.arccos(np.clip(0.5 * (traces - 1), -1, 1)))
+    angles = angles_deg(rotations[1:] @ rotations[:-1].swapaxes(1, 2))
     return float(np.median(angles)) < CLIP_ANGLE
 
 

@@ -177,10 +177,7 @@ def disagreements(frames: Frames, rotations: np.ndarray) -> np.ndarray:
         shown += counts
         parts = counts / np.maximum(pixels, 1)
         for of_channel, channel in zip(sums, colors.T, strict=True):
-            means = (
-                np.bincount(place, np.broadcast_to(channel, (count, len(channel))).ravel(), whole)
-                * parts
-            )
+            means = np.bincount(place, np.tile(channel, count), whole) * parts
             of_channel += means
             squares += means**2
     pairs = (shown * (shown - 1) / 2).reshape(count, -1).sum(1)
