@@ -112,10 +112,14 @@ def measure_precision(
     """
 
     def change(steps: Mapping[str, float], names: Iterable[str] = exact) -> float:
-        """Return the mean square over all values, with the tensors of these names quantised."""
-        return mean_square_change(
-            wanted, draw(to_checkpoint_tensors(quantize_tensors(exact, steps, names)))
+        """Return the mean square over all values in [0, 1], with the tensors of these names
+        quantised; NaN where an image is."""
+        drawn = draw(to_checkpoint_tensors(quantize_tensors(exact, steps, names)))
+        total = sum(
+            float((x.clamp(0, 1) - y.clamp(0, 1)).double().square().sum())
+            for x, y in zip(wanted, drawn, strict=True)
         )
+        return total / max(sum(x.numel() for x in wanted), 1)
 
     allowed = (max_change / GREY_LEVELS) ** 2
     groups: dict[str, dict[str, Tensor]] = {}
@@ -160,16 +164,6 @@ def quantize_tensors(
         coding = choose_coding(name, exact[name], steps, by_coarseness=coarseness is not None)
         found[name] = round_trip(exact[name], coding, coarseness)
     return found
-
-
-def mean_square_change(before: Sequence[Tensor], after: Sequence[Tensor]) -> float:
-    """Return the mean square over all values of images in [0, 1], after clamping; NaN where one of
-    them is."""
-    total = sum(
-        float((x.clamp(0, 1) - y.clamp(0, 1)).double().square().sum())
-        for x, y in zip(before, after, strict=True)
-    )
-    return total / max(sum(x.numel() for x in before), 1)
 
 
 def _scaled(

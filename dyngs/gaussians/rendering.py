@@ -304,10 +304,9 @@ def _handle_nonfinite(gaussians: Gaussians, policy: str) -> Gaussians:
     cleaned: dict[str, Tensor] = {}
     for name, x in gaussians.tensors().items():
         mask = keep.view(-1, *[1] * (x.ndim - 1))
-        cleaned[name] = torch.where(mask, x, torch.zeros_like(x))
+        cleaned[name] = x.masked_fill(~mask, 0)
     # opacity exactly 0: culled, without gradient
-    hidden = torch.full_like(gaussians.logit_opacities, -1e4)
-    cleaned["logit_opacities"] = torch.where(keep, cleaned["logit_opacities"], hidden)
+    cleaned["logit_opacities"] = gaussians.logit_opacities.masked_fill(~keep, -1e4)
     return Gaussians(**cleaned)
 
 
