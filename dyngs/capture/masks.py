@@ -57,10 +57,11 @@ class MatteParams:
     unsure: float = 0.02  # largest error of a detector's outline
     inside: float = 0.03  # distance inside the mask up to which pixels may be background
     # distance outside the mask up to which pixels may be of the person, in both passes
-    outside: tuple[float, float] = (0.03, 0.01)
+    outside: tuple[float, float] = (0.015, 0.01)
     core: float = 0.01  # distance from the outline at which pixels are certainly of the person
     colours: float = 0.008  # standard deviation of the average of their colours
     noise: float = 20.0  # grey levels, expected error of colours
+    background_noise: float = 8.0  # weight of the variation of the background over time
     slope: float = 2.0  # of alpha: pixels that are almost covered count as covered
     smoothing: float = 0.0045  # standard deviation by which the outlines of masks are smoothed
     # steepness of smoothed outlines, so that about two pixels are partly covered, as in photos
@@ -182,7 +183,12 @@ def estimate_alpha(
     known = np.logical_not(near).sum(0) >= SEEN_BARE
     bare = np.ma.masked_array(images, np.broadcast_to(near[..., None], images.shape))
     colours = np.ma.median(bare, axis=0).filled(0).astype(np.float32)
-    background = Background(colours, np.full(known.shape, NOISE, np.float32))
+    away = np.stack([_away(colours, image) for image in images])[:, known]
+    away[near[:, known]] = np.nan
+    noise = np.full(known.shape, NOISE, np.float32)
+    noise[known] = np.nanpercentile(away, 75, axis=0)
+    # Where a camera shakes or leaves move, edges of the background are unreliable.
+    background = Background(colours, ndimage.maximum_filter(noise, 5))
     result = np.zeros(masks.shape, np.float32)
     for i, (image, mask) in enumerate(zip(images, masks, strict=True)):
         result[i] = soften_outline(mask)
@@ -226,7 +232,8 @@ def _alpha(
     ratio = np.sqrt(difference / contrast.clip(1.0))
     ratio = (0.5 + MATTE.slope * (ratio - 0.5)).clip(0, 1)
     ratio[shadow] = 0
-    confidence = contrast / (contrast + MATTE.noise**2)
+    noise = np.square(MATTE.noise) + np.square(MATTE.background_noise * background.noise)
+    confidence = contrast / (contrast + noise)
     near = (_distance(mask) <= MATTE.inside * height) & (
         _distance(~mask) <= max(outside * height, 2)
     )
