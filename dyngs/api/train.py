@@ -321,13 +321,13 @@ class _Run:
                     f"stopped after step {loop.trainer.done}; go on with: dyngs train --resume "
                     f"{quote_path(self.folder)}"
                 )
-            for line in self._reached():
-                loop.emit(Message(line))
             if self._body_kind is not None and isinstance(loop.trainer, Trainer):
                 (self.folder / PICTURES).mkdir(exist_ok=True)
                 scene = loop.trainer.model.scene
                 picture = self._body_kind.write_avatar_picture(scene, self.folder / PICTURES)
                 loop.emit(Message(f"see {picture}"))
+            for line in self._reached():
+                loop.emit(Message(line))
         write_requested_config(self.folder, self._plan.requested)
 
     def _save_and_evaluate(self, event: Event) -> None:

@@ -8,6 +8,7 @@ A run folder holds ``config.yaml`` (resolved), ``checkpoints/step_0007000.safete
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 from dataclasses import asdict, dataclass, replace
@@ -148,7 +149,8 @@ def seconds_at(run_dir: Path, step: int) -> float:
 def _read_seconds(run_dir: Path) -> dict[str, float]:
     try:
         stored = json.loads(read_limited(run_dir / TIMING_NAME, _MOST_TIMING_BYTES))
-        return {str(int(step)): float(x) for step, x in stored["seconds_train"].items()}
+        known = {str(int(step)): float(x) for step, x in stored["seconds_train"].items()}
+        return {step: seconds for step, seconds in known.items() if math.isfinite(seconds)}
     except Exception:  # a missing or damaged file only loses the times
         return {}
 
