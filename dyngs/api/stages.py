@@ -44,7 +44,8 @@ def share_views(plan: RunPlan, processes: Processes) -> RunPlan:
     minutes = config.train.minutes
     if minutes is not None:
         raise DyngsError(
-            f"train.minutes={minutes:g}: is measured with one process; leave it out, or start without torchrun"
+            f"train.minutes={minutes:g}: is measured with one process; leave it out, or start "
+            "without torchrun"
         )
     if config.train.batch_size == 1:
         train = config.train.model_copy(update={"batch_size": processes.size})
@@ -159,8 +160,8 @@ def extend_run(plan: RunPlan, folder: Path, resumed: Checkpoint | None) -> RunPl
         minutes = None
     if resumed is None:
         raise DyngsError(
-            f"train.steps={steps}: {folder} has no checkpoint to go on from; remove it, or give another run.dir, "
-            "and begin with so many steps"
+            f"train.steps={steps}: {folder} has no checkpoint to go on from; remove it, or give "
+            "another run.dir, and begin with so many steps"
         )
     require_folder(stored.data.root)
     done = resumed.info.step

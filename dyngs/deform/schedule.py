@@ -110,7 +110,8 @@ class TimeWindow:
             len(self.time_offsets),
             max(MIN_WINDOW_VIEWS, math.ceil(self.initial_fraction * len(self.time_offsets))),
         )
-        first, last = self.schedule.window_grows_from, self.schedule.window_full_at
+        first = self.schedule.window_grows_from
+        last = self.schedule.window_full_at
         progress = (step - first) / max(last - first, 1)
         return start + int(min(max(progress, 0.0), 1.0) * (len(self.time_offsets) - start))
 

@@ -27,8 +27,8 @@ class Detection:
     """Person detected in an image.
 
     Attributes:
-        keypoints: (25, 3) float32 in the order of ``KEY_POINTS``: column and row, px, and confidence
-            in [0, 1].
+        keypoints: (25, 3) float32 in the order of ``KEY_POINTS``: column and row, px, and
+            confidence in [0, 1].
         mask: (H, W) uint8, 255 = the person.
         positions: (25, 3) float32, estimated positions of the key points relative to the hips, in
             axes of the camera (x right, y down, z forward), m; None: not estimated.

@@ -36,8 +36,9 @@ left_knee right_knee left_ankle right_ankle {26 * "- "} right_wrist {20 * "- "} 
 """
 # After the body: the feet, the face, and 21 points of each hand.
 _WHOLE_BODY: str = f"""
-{_COCO} left_toe - left_heel right_toe - right_heel {68 * "- "} {5 * "- "} left_index1 {11 * "- "} left_pinky1
-{3 * "- "} {5 * "- "} right_index1 {11 * "- "} right_pinky1 {3 * "- "}
+{_COCO} left_toe - left_heel right_toe - right_heel {68 * "- "}
+{5 * "- "} left_index1 {11 * "- "} left_pinky1 {3 * "- "}
+{5 * "- "} right_index1 {11 * "- "} right_pinky1 {3 * "- "}
 """
 _IN_IMAGES = {
     17: _COCO.split(),
@@ -100,8 +101,8 @@ def read_keypoints(path: Path, views: Sequence[View]) -> Keypoints:
     """Read the key points of views from a folder of OpenPose files or from a COCO file.
 
     OpenPose: ``NAME_keypoints.json`` or ``NAME.json`` per image, ``pose_keypoints_2d`` with 25 or
-    18 points. COCO: 17 or 133 points (with feet and hands). The most confident of several people is used. Raises
-    DyngsError: another format, or no view of the capture.
+    18 points. COCO: 17 or 133 points (with feet and hands). The most confident of several people
+    is used. Raises DyngsError: another format, or no view of the capture.
     """
     named = _by_name(views)
     keypoints: Keypoints = {}

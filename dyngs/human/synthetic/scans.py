@@ -119,7 +119,7 @@ def texture_paint(uv: np.ndarray, uv_faces: np.ndarray, texture: np.ndarray) -> 
 
 
 def _texture(path: Path, material: Any) -> np.ndarray:
-    """Return the texture (height, width, 3) of the material of a scan, else of an image beside it."""
+    """Return the texture (height, width, 3) of a scan's material, else of an image beside it."""
     from PIL import Image
 
     image = getattr(material, "image", getattr(material, "baseColorTexture", None))
