@@ -180,22 +180,25 @@ def estimate_alpha(
     near: np.ndarray = np.stack(
         [ndimage.binary_dilation(mask, iterations=radius) for mask in masks]
     ).astype(bool)
-    known = np.logical_not(near).sum(0) >= SEEN_BARE
+    num_bare = np.logical_not(near).sum(0)
+    known = num_bare >= SEEN_BARE
     bare = np.ma.masked_array(images, np.broadcast_to(near[..., None], images.shape))
     colours = np.ma.median(bare, axis=0).filled(0).astype(np.float32)
-    away = np.stack([_away(colours, image) for image in images])[:, known]
-    away[near[:, known]] = np.nan
-    noise = np.full(known.shape, NOISE, np.float32)
-    noise[known] = np.nanpercentile(away, 75, axis=0)
-    # Where a camera shakes or leaves move, edges of the background are unreliable.
+    # Where a camera shakes or leaves move, edges of the background are unreliable: the noise is
+    # the upper quartile over the images without the person, and the largest of the neighbours.
+    away = np.where(near, np.inf, np.stack([_away(colours, image) for image in images]))
+    away.sort(axis=0)
+    quartile = (0.75 * (num_bare - 1)).clip(0).astype(np.int64)
+    noise = np.take_along_axis(away, quartile[None], 0)[0]
+    noise = np.where(known, noise, NOISE).clip(NOISE).astype(np.float32)
     background = Background(colours, ndimage.maximum_filter(noise, 5))
     result = np.zeros(masks.shape, np.float32)
     for i, (image, mask) in enumerate(zip(images, masks, strict=True)):
-        result[i] = soften_outline(mask)
-        usable = known if others is None else known & ~others[i]
         core = _inner(mask, MATTE.core)
         if not core.any():
+            result[i] = soften_outline(mask)
             continue
+        usable = known if others is None else known & ~others[i]
         shadow = _shadow(background, image) & ~mask
         first = _alpha(background, image, mask, usable, shadow, MATTE.outside[0])
         found = ndimage.binary_opening(first > 0.5)
@@ -204,6 +207,8 @@ def estimate_alpha(
         found &= (sizes > LEAST_FRACTION * sizes.max())[labels]
         if (found & mask).sum() > MATTE.agreed * (found | mask).sum():
             result[i] = _alpha(background, image, found, usable, shadow, MATTE.outside[1])
+        else:
+            result[i] = soften_outline(mask)
     return result
 
 

@@ -65,9 +65,13 @@ class HumanKind(HasGaussians, HasBody):
     def copy_pictures(self, data: DataConfig, folder: Path) -> None:
         for source in (data.root, data.body):
             for name in ("people.png", "detection.png", "fit_overlays.png"):
-                if source is not None and (source / name).is_file():
+                # A capture from elsewhere may link to other files.
+                if source is None or (source / name).is_symlink():
+                    continue
+                if (source / name).is_file():
                     folder.mkdir(exist_ok=True)
-                    shutil.copy(source / name, folder)
+                    # Without permissions: captures may be read-only.
+                    shutil.copyfile(source / name, folder / name)
 
     def write_avatar_picture(self, scene: HumanScene, folder: Path) -> Path:
         from dyngs.human.avatar.picture import avatar_picture

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from dyngs.core.camera import Cameras
+from dyngs.data.geometry import look_at
 from dyngs.data.images.images import to_straight_uint8
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.motion.motion import MotionClip
@@ -31,7 +32,7 @@ def avatar_picture(scene: HumanScene) -> np.ndarray:
         torch.ones(1, device="cpu"),
     )
     avatar = avatar.with_corrected_motion(rest)
-    middle = (joints.amin(0) + joints.amax(0)) / 2
+    middle = ((joints.amin(0) + joints.amax(0)) / 2).double().numpy()
     focal = SIDE_PX * DISTANCE / FIELD
     intrinsics = torch.tensor(
         [[focal, 0, SIDE_PX / 2], [0, focal, SIDE_PX / 2], [0, 0, 1]], device="cpu"
@@ -39,11 +40,9 @@ def avatar_picture(scene: HumanScene) -> np.ndarray:
     cells = []
     for number, side in enumerate(_SIDES):
         angle = number * math.pi / 2
-        backward = torch.tensor([math.sin(angle), 0, math.cos(angle)], device="cpu")
-        down = torch.tensor([0.0, -1.0, 0.0], device="cpu")
-        pose = torch.eye(4, device="cpu")
-        pose[:3, :3] = torch.stack([torch.linalg.cross(down, -backward), down, -backward])
-        pose[:3, 3] = -pose[:3, :3] @ (middle + DISTANCE * backward)
+        eye = middle + DISTANCE * np.array([math.sin(angle), 0.0, math.cos(angle)])
+        world_from_cam = look_at(eye, middle, np.array([0.0, 1.0, 0.0]))
+        pose = torch.from_numpy(np.linalg.inv(world_from_cam)).float()
         camera = Cameras(pose[None], intrinsics[None], SIDE_PX, SIDE_PX)
         white = torch.ones(3, device="cpu")
         image = avatar.render(camera, 0.0, background=white, options=avatar.options).rgb[0]

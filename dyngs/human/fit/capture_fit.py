@@ -20,7 +20,7 @@ from torch import Tensor
 from dyngs.config import DataConfig
 from dyngs.core.camera import Cameras
 from dyngs.core.conventions import ProgressCallback, RasterizeMode, ignore_progress
-from dyngs.core.errors import DyngsError
+from dyngs.core.errors import DyngsError, quote_path
 from dyngs.data.body_frames import assign_frame_numbers, frame_number
 from dyngs.data.capture import Capture, Split, View
 from dyngs.data.images.images import area_downscale
@@ -720,7 +720,8 @@ def fit_capture(
     if capture.body is None and not keypoints and not joints:
         raise DyngsError(
             f"{capture.root}: has neither body parameters nor key points of the person; run `dyngs "
-            "data people`, or give key points of another program (--keypoints, `dyngs docs people`)"
+            f"data people {quote_path(capture.root)} OUT`, or give key points of another program "
+            "(--keypoints, `dyngs docs people`)"
         )
     if not capture.has_alpha:
         raise DyngsError(

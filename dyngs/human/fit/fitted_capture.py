@@ -29,7 +29,7 @@ from dyngs.core.conventions import ProgressCallback, ignore_progress
 from dyngs.core.errors import DyngsError, format_count, log_info, wrap_read_errors
 from dyngs.data.body_frames import assign_frame_numbers, frame_number, read_body_file
 from dyngs.data.capture import BodyFrames, Capture, Split, View, group_by_camera
-from dyngs.data.geometry import to_opengl_pose
+from dyngs.data.geometry import camera_center, to_opengl_pose
 from dyngs.data.images.images import to_straight_uint8
 from dyngs.data.images.maps import silhouette_box
 from dyngs.data.loader import ImageLoader
@@ -126,7 +126,7 @@ def write_fitted_capture(
         is_size_known = capture.body is not None or inputs.joints is not None
         centre = None if is_size_known else _fixed_camera_centre(views)
         if options.stature is not None and centre is None:
-            raise _size_is_known(options)
+            raise _known_size_error(options)
         # The fit starts from the shape of a known person, or from that of the capture.
         known_body = person
         if known_body is None and body.name != "anny" and capture.body is not None:
@@ -229,7 +229,7 @@ def write_fitted_capture(
     return FittedCapture(out, fit, model, "\n".join(lines))
 
 
-def _size_is_known(options: DataConfig) -> DyngsError:
+def _known_size_error(options: DataConfig) -> DyngsError:
     return DyngsError(
         f"data.stature={options.stature:g}: the size of the person in {options.root} is known from "
         "several camera positions, or from given poses; remove it"
@@ -241,7 +241,7 @@ def _fixed_camera_centre(views: Sequence[View]) -> torch.Tensor | None:
     poses = np.stack([view.cam_from_world for view in views])
     if not np.allclose(poses, poses[0], atol=1e-6):
         return None
-    return torch.from_numpy(np.linalg.inv(poses[0])[:3, 3]).float()
+    return torch.from_numpy(camera_center(poses[0])).float()
 
 
 def _standing_height(body: BodyTemplate, fit: CaptureFit) -> float:
@@ -696,7 +696,7 @@ def ensure_fitted_body(
     capture = read_capture(data)
     body_frames = None if capture.body is None else capture.body["train"]
     if body_frames is not None and data.stature is not None:
-        raise _size_is_known(data)
+        raise _known_size_error(data)
     if body_frames is not None and only_if_needed:
         return data
     body = load_template(model)

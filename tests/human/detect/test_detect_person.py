@@ -165,6 +165,35 @@ def test_a_capture_of_the_person_comes_out(clip: Path, tmp_path: Path, short_fit
         write_detected_person(DataConfig(root=clip), out, Rough(), log=[].append)
 
 
+def test_silhouettes_of_the_images_are_kept(clip: Path, tmp_path: Path, short_fits: None) -> None:
+    """The detector's are 1 px off."""
+    for number in range(COUNT):
+        image = read_image(clip / f"f{number}.png").numpy()
+        alpha = (255 * truth(number)).astype(np.uint8)[..., None]
+        write_image(tmp_path / "rgba" / f"f{number}.png", np.concatenate([image, alpha], axis=2))
+    options = DataConfig(root=tmp_path / "rgba", frames="0:4")
+    said: list[str] = []
+    write_detected_person(options, tmp_path / "ann", Rough(), log=said.append)
+    assert "using the silhouettes of the images; only key points are detected" in said
+    views = all_views(read_capture(DataConfig(root=tmp_path / "ann")).splits)
+    areas = [int((read_image(view.image_path)[..., 3] > 127).sum()) for view in views]
+    assert areas == [int(truth(number).sum()) for number in range(4)]
+
+
+def test_pictures_are_copied_into_a_run(tmp_path: Path) -> None:
+    """Not those that link to files elsewhere."""
+    root = tmp_path / "capture"
+    write_image(root / "detection.png", np.zeros((2, 2, 3), np.uint8))
+    (root / "detection.png").chmod(0o444)
+    (tmp_path / "secret").write_text("x")
+    (root / "people.png").symlink_to(tmp_path / "secret")
+    folder = tmp_path / "pictures"
+    for _ in range(2):  # a run may begin again
+        HUMAN.copy_pictures(DataConfig(root=root), folder)
+    assert [path.name for path in folder.iterdir()] == ["detection.png"]
+    assert folder.joinpath("detection.png").stat().st_mode & 0o200
+
+
 def test_the_stature_scales_the_person_about_the_camera(
     clip: Path, tmp_path: Path, short_fits: None
 ) -> None:
